@@ -1,0 +1,22 @@
+//! What an alarm is like.
+
+use std::time::Duration;
+
+use crate::process_image::{AlarmIndex, Priority};
+
+/// The behaviour of one alarm.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AlarmSpec {
+    /// How urgent.
+    pub priority: Priority,
+    /// The condition must hold this long before the alarm is raised.
+    pub on_delay: Duration,
+    /// The condition must be gone this long before the alarm returns.
+    pub off_delay: Duration,
+    /// Stays after its condition has gone, until it is acknowledged and reset.
+    pub latch: bool,
+    /// Alarms that tell the cause: while one of them is active this one is suppressed.
+    pub suppressed_by: Vec<AlarmIndex>,
+    /// First-out group: the first alarm of a group to be raised since all of it was quiet is marked.
+    pub first_out_group: Option<u32>,
+}

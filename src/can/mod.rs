@@ -1,0 +1,152 @@
+//! CAN buses: what a frame is, what can happen on a bus, and the ways to reach one.
+//!
+//! Not here: what a frame means. That is [`canopen`](crate::canopen)'s business.
+//!
+//! - [`frame`]: classical CAN frames, pure.
+//! - this file: [`BusEvent`] and the [`CanBus`] trait, the seam between a bus and the gateway.
+//! - `interface`: how an interface is written (`can0`, `virtual:demo`, `slcan:/dev/ttyACM0`).
+//! - `socketcan`, `virtual_bus`, `slcan` \[IO\]: the three kinds of bus.
+//! - `task` \[IO\]: owns one bus: opens, reads, writes, reopens, counts.
+//! - `recording`: candump logs.
+
+pub mod frame;
+
+use std::future::Future;
+
+pub use frame::{CanFrame, CanId, ParseFrameError};
+
+use crate::time::Now;
+
+/// Which of the configured buses, by its place in the configuration.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct BusIndex(pub usize);
+
+/// What a bus tells the gateway. `at` is the receive time of the kernel where it gives one.
+#[derive(Clone, Debug, PartialEq)]
+pub enum BusEvent {
+    /// A frame was received from another node. Frames that the gateway itself sent are not echoed here.
+    Frame {
+        /// The frame.
+        frame: CanFrame,
+        /// When it was received.
+        at: Now,
+    },
+    /// The link or the controller changed its state.
+    Link {
+        /// The new state.
+        link: Link,
+        /// When.
+        at: Now,
+    },
+    /// A frame that the gateway asked to send did not leave: it is not the node's fault if no answer comes.
+    NotSent {
+        /// The frame.
+        frame: CanFrame,
+        /// When the sending was given up.
+        at: Now,
+    },
+    /// Counters since the start, reported once a second and at every change of `overruns`.
+    Counters {
+        /// The counters.
+        counters: BusCounters,
+        /// When.
+        at: Now,
+    },
+}
+
+/// The state of an interface and its controller.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Link {
+    /// There is no such interface, or it cannot be opened.
+    #[default]
+    Absent,
+    /// The interface is there but down.
+    Down,
+    /// Working; both error counters are low.
+    ErrorActive,
+    /// Working, with an error counter over 127: wiring, bit rate, or nobody acknowledges.
+    ErrorPassive,
+    /// The controller has left the bus after 256 transmit errors.
+    BusOff,
+}
+
+impl Link {
+    /// Whether frames can be sent and received.
+    #[must_use]
+    pub fn is_up(self) -> bool {
+        matches!(self, Self::ErrorActive | Self::ErrorPassive)
+    }
+}
+
+/// What happened on a bus since the gateway started. All counters saturate.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct BusCounters {
+    /// Frames received, of every kind but error frames.
+    pub frames_received: u64,
+    /// Frames sent.
+    pub frames_sent: u64,
+    /// Frames that were to be sent and were given up: queue full, link down, no acknowledge.
+    pub frames_not_sent: u64,
+    /// Error frames that report a bus error (not mere state changes).
+    pub error_frames: u64,
+    /// CAN FD frames, which no device here sends (R-DET-006).
+    pub fd_frames: u64,
+    /// Times that the controller went bus-off.
+    pub bus_off_count: u64,
+    /// Frames that the kernel dropped because we read too slowly (`SO_RXQ_OVFL`).
+    pub overruns: u64,
+    /// Bits of all frames seen or sent, [`CanFrame::wire_bits`]: the load is their rate over the bit rate.
+    pub wire_bits: u64,
+    /// Bit rate in bit/s, where the interface tells it.
+    pub bit_rate: Option<u32>,
+}
+
+/// One way to reach a CAN bus. The only IO trait of the crate: tests put a simulated bus behind it.
+pub trait CanBus: Send {
+    /// Waits for what happens next. Cancel-safe: dropping the future loses no frame.
+    ///
+    /// # Errors
+    /// The bus is unusable and has to be opened again.
+    fn recv(&mut self) -> impl Future<Output = Result<BusEvent, BusError>> + Send;
+
+    /// Sends a frame, or gives up after a short time; never queues behind a dead bus.
+    ///
+    /// # Errors
+    /// The frame did not leave.
+    fn send(&mut self, frame: &CanFrame) -> impl Future<Output = Result<(), BusError>> + Send;
+}
+
+/// Why a bus could not be used. Printed once, by the task that owns it.
+#[derive(Debug, thiserror::Error)]
+pub enum BusError {
+    /// There is no such interface.
+    #[error("interface `{interface}` is not there: {source}")]
+    Absent {
+        /// As written in the configuration.
+        interface: String,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// The interface is down, or went down.
+    #[error("interface `{interface}` is down; bring it up with `ip link set {interface} up`")]
+    Down {
+        /// As written in the configuration.
+        interface: String,
+    },
+    /// The transmit queue stayed full: nobody acknowledges, or the bus is overloaded.
+    #[error(
+        "the transmit queue of `{interface}` stayed full: nobody on the bus acknowledges, or it is overloaded"
+    )]
+    Busy {
+        /// As written in the configuration.
+        interface: String,
+    },
+    /// Anything else that the system reports.
+    #[error("interface `{interface}`: {source}")]
+    Io {
+        /// As written in the configuration.
+        interface: String,
+        /// What the system says.
+        source: std::io::Error,
+    },
+}

@@ -1,0 +1,149 @@
+//! What a network tells the gateway.
+
+use super::{NmtRequest, NmtState, NodeId, PdoIndex};
+use crate::can::{CanFrame, CanId};
+
+/// Output of [`Network`](super::Network).
+#[derive(Clone, Debug, PartialEq)]
+pub enum NetworkOutput {
+    /// Send this frame. Only frames of the kinds that the settings allow are ever asked for.
+    Transmit(CanFrame),
+    /// Something happened to a configured node.
+    Node(NodeId, NodeEvent),
+    /// Something happened that belongs to no configured node.
+    Foreign(ForeignEvent),
+}
+
+/// What happened to a node.
+#[derive(Clone, Debug, PartialEq)]
+pub enum NodeEvent {
+    /// A TPDO with a usable length; `data` beyond `length` is padding.
+    Pdo {
+        /// Which.
+        pdo: PdoIndex,
+        /// The bytes of the frame.
+        data: [u8; 8],
+        /// How many of them were sent.
+        length: u8,
+    },
+    /// A TPDO was too short (discarded) or too long (decoded unless strict), R-DET-080, R-DET-081.
+    PdoLength {
+        /// Which.
+        pdo: PdoIndex,
+        /// DLC received.
+        received: u8,
+        /// Whether it was thrown away.
+        discarded: bool,
+    },
+    /// A supervised TPDO did not come in time (R-DET-082).
+    PdoTimeout {
+        /// Which.
+        pdo: PdoIndex,
+    },
+    /// A TPDO came while the node was believed not operational (R-DET-083).
+    PdoInUnexpectedState {
+        /// Which.
+        pdo: PdoIndex,
+        /// The believed state.
+        state: Option<NmtState>,
+    },
+    /// The first sign of life since the gateway started, or since `NeverSeen`.
+    Seen,
+    /// No frame at all since the gateway started (R-DET-001).
+    NeverSeen,
+    /// The state changed. `ordered`: by the gateway itself, or the normal end of initialisation.
+    State {
+        /// Believed state before.
+        from: Option<NmtState>,
+        /// State now.
+        to: NmtState,
+        /// Whether the gateway asked for it.
+        ordered: bool,
+    },
+    /// A boot-up message from a node that was running (R-DET-039): its data is stale.
+    Restarted,
+    /// A state code that CiA 301 does not define (R-DET-041); reported once per change.
+    InvalidState {
+        /// Bits 6..0 of the reply.
+        raw: u8,
+    },
+    /// A guard request was not answered in time (R-DET-033).
+    GuardMissed {
+        /// Consecutive misses and toggle errors so far.
+        consecutive: u16,
+    },
+    /// A reply had the wrong toggle bit (R-DET-035).
+    ToggleError {
+        /// Consecutive misses and toggle errors so far; unchanged when the policy accepts the reply.
+        consecutive: u16,
+    },
+    /// The life time ran out (R-DET-036): no value can be trusted.
+    Lost {
+        /// Whether wrong toggle bits, not silence, were the cause: the device's CPU may be dead.
+        stuck_toggle: bool,
+    },
+    /// A valid reply, heartbeat or boot-up ended the loss (R-DET-037).
+    Recovered,
+    /// A non-zero state frame nobody had asked for (R-DET-045); reported once.
+    UnsolicitedState,
+    /// Somebody else sends guard requests to this node (R-DET-043); reported once until 60 s of silence.
+    ForeignGuardMaster,
+    /// A frame on the error control identifier with a wrong length (R-DET-042), or a remote or 29-bit frame on one of
+    /// the node's identifiers (R-DET-006): ignored.
+    Malformed {
+        /// The frame.
+        frame: CanFrame,
+    },
+    /// The gateway sends an NMT command to this node.
+    NmtSent {
+        /// Which.
+        request: NmtRequest,
+    },
+    /// Three start commands had no effect (R-DET-020).
+    StartFailed {
+        /// Start commands sent so far.
+        attempts: u32,
+    },
+    /// The node is operational after a `StartFailed`.
+    StartSucceeded,
+    /// An emergency message (R-DET-091).
+    Emergency {
+        /// Error code; 0 = error reset or no error.
+        code: u16,
+        /// Error register.
+        register: u8,
+        /// Manufacturer bytes.
+        vendor: [u8; 5],
+    },
+    /// Two nodes seem to share this id: TPDOs far too often, boot-up messages while TPDOs go on, toggle errors with all
+    /// requests answered twice.
+    DuplicateSuspected {
+        /// What was seen.
+        evidence: &'static str,
+    },
+    /// Nothing suspicious for 30 s after `DuplicateSuspected`.
+    DuplicateCleared,
+    /// Any frame on one of this node's identifiers, for the frame counter; precedes what the frame caused.
+    FrameSeen,
+}
+
+/// What happened beside the configured nodes.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ForeignEvent {
+    /// An NMT command that the gateway did not send: there is another master.
+    NmtCommand {
+        /// Its command byte.
+        command: u8,
+        /// Its node id byte, 0 = all.
+        node: u8,
+    },
+    /// A frame of an identifier that belongs to no configured node.
+    UnknownId {
+        /// The identifier.
+        id: CanId,
+        /// The node id, where the identifier belongs to the predefined connection set.
+        node: Option<NodeId>,
+        /// Whether it is the first frame of this identifier.
+        first: bool,
+    },
+}

@@ -1,0 +1,31 @@
+//! A CANopen master (CiA 301, CiA 302-2), pure: no clock, no socket, no thread.
+//!
+//! [`Network`] is one bus seen by its NMT master (or by a passive listener). It has four verbs, as everything in this
+//! crate that lives in time: `handle_*` takes what came in, `handle_timeout` what became due, `poll_output` gives what
+//! is to be done, `poll_timeout` when to come back.
+//!
+//! Not here: what the bytes of a PDO mean (`mapping`), alarms, values. This room knows
+//! `can::frame` and `time` only and could be lifted out as a crate of its own.
+//!
+//! - [`cob_id`]: node ids and identifiers.
+//! - [`nmt`]: states and commands.
+//! - [`settings`]: what a network and its nodes are to do.
+//! - [`event`]: what a network tells.
+//! - `guarding`, `heartbeat`, `start`, `pdo`: one machine each, for one node.
+//! - `node`: one node, made of those machines.
+//! - `network`: all nodes of a bus; dispatches frames.
+
+pub mod cob_id;
+pub mod event;
+pub mod network;
+pub mod nmt;
+pub mod settings;
+
+pub use cob_id::NodeId;
+pub use event::{ForeignEvent, NetworkOutput, NodeEvent};
+pub use network::Network;
+pub use nmt::{NmtRequest, NmtState};
+pub use settings::{
+    ErrorControl, GuardingSettings, NetworkSettings, NodeSettings, PdoIndex, PdoSettings, Role,
+    StartSettings, TogglePolicy,
+};

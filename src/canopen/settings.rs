@@ -1,0 +1,149 @@
+//! What a network and its nodes are to do. Plain data; checked by whoever reads it from a file.
+
+use std::time::Duration;
+
+use super::NodeId;
+use crate::can::CanId;
+
+/// What the gateway may do on a bus.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Role {
+    /// NMT master: starts and guards its nodes.
+    #[default]
+    Master,
+    /// Sends nothing at all; derives what it can from what it overhears.
+    Passive,
+}
+
+/// One bus with its nodes.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct NetworkSettings {
+    /// Master or passive.
+    pub role: Role,
+    /// Start all nodes with one broadcast instead of one by one (R-DET-018). Off unless asked for.
+    pub start_broadcast: bool,
+    /// The nodes; at most one for each node id.
+    pub nodes: Vec<NodeSettings>,
+}
+
+/// One node.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NodeSettings {
+    /// Its id.
+    pub id: NodeId,
+    /// How its life is watched.
+    pub error_control: ErrorControl,
+    /// How it is started.
+    pub start: StartSettings,
+    /// The TPDOs that it sends, in the order of the mapping; [`PdoIndex`] counts in it.
+    pub pdos: Vec<PdoSettings>,
+    /// How long after the start of the gateway a node that showed no frame at all is reported (R-DET-001).
+    pub never_seen_after: Duration,
+}
+
+/// Which TPDO of a node, by its place in [`NodeSettings::pdos`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct PdoIndex(pub usize);
+
+/// How the life of a node is watched; guarding and heartbeat exclude each other (R-DET-044).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ErrorControl {
+    /// The gateway asks by remote frame, the node answers with its state and a toggle bit.
+    Guarding(GuardingSettings),
+    /// The node tells its state by itself.
+    Heartbeat {
+        /// Lost after this long without a frame on `0x700 + id`.
+        timeout: Duration,
+    },
+    /// Not at all.
+    None,
+}
+
+/// Node guarding (CiA 301, R-DET-031..046).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GuardingSettings {
+    /// Time between two requests, 20 ms..65.535 s (R-DET-031).
+    pub guard_time: Duration,
+    /// Consecutive missed replies until the node is lost, 1..=255 (R-DET-032).
+    pub life_time_factor: u8,
+    /// A reply later than this is missed; at most the guard time (R-DET-033).
+    pub reply_timeout: Duration,
+    /// What a wrong toggle bit means (R-DET-035).
+    pub toggle: TogglePolicy,
+    /// What is expected after a wrong toggle bit.
+    pub toggle_resync: bool,
+    /// DLC of the request: 1 for most devices, 0 for some.
+    pub rtr_dlc: u8,
+    /// Pause between an NMT command to the node and the next request.
+    pub settle: Duration,
+}
+
+impl Default for GuardingSettings {
+    fn default() -> Self {
+        Self {
+            guard_time: Duration::from_millis(500),
+            life_time_factor: 3,
+            reply_timeout: Duration::from_millis(100),
+            toggle: TogglePolicy::Strict,
+            toggle_resync: false,
+            rtr_dlc: 1,
+            settle: Duration::from_millis(20),
+        }
+    }
+}
+
+/// What a reply with the wrong toggle bit means (R-DET-035).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum TogglePolicy {
+    /// As if it had not come.
+    #[default]
+    Strict,
+    /// Counted, but accepted.
+    Warn,
+    /// Not looked at.
+    Off,
+}
+
+/// How a node is started (R-DET-016..020).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StartSettings {
+    /// Send NMT start when it reports pre-operational, or stopped without our order.
+    pub auto_start: bool,
+    /// After a boot-up message start at the latest after this long.
+    pub delay: Duration,
+    /// A start that shows no effect for this long is repeated.
+    pub confirm: Duration,
+    /// Time between repeated starts.
+    pub retry: Duration,
+    /// Send reset node when a lost node comes back. Off: a reset of a protection device is the operator's decision.
+    pub reset_on_recovery: bool,
+}
+
+impl Default for StartSettings {
+    fn default() -> Self {
+        Self {
+            auto_start: true,
+            delay: Duration::from_millis(500),
+            confirm: Duration::from_millis(1000),
+            retry: Duration::from_millis(1000),
+            reset_on_recovery: false,
+        }
+    }
+}
+
+/// One TPDO.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PdoSettings {
+    /// TPDO number, 1-based, for messages.
+    pub number: u16,
+    /// Its identifier, with the node id already added.
+    pub cob_id: CanId,
+    /// Bytes that the mapping uses; a shorter frame is discarded as a whole (R-DET-080).
+    pub length: u8,
+    /// Discard a longer frame too (R-DET-081).
+    pub strict_length: bool,
+    /// Stale after this long while the node is operational; `None` = not supervised (R-DET-082).
+    pub timeout: Option<Duration>,
+    /// Expected time between two frames, where it is known: a rate of over 1.5 times that of the shortest is suspicious.
+    pub shortest_period: Option<Duration>,
+}

@@ -1,0 +1,1 @@
+//! Settings of this installation: one TOML file, environment variables over it, all checked before anything starts.

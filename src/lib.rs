@@ -1,0 +1,74 @@
+//! # cangate: a CANopen gateway to Modbus TCP and MQTT
+//!
+//! **This page is the map of the code.**
+//!
+//! ```text
+//! CAN bus                                                             plant network
+//!    |  frames                                                              ^
+//!    v                                                                      |
+//! can/task ---BusEvent---> gateway/task ---- process image ---> modbus/server   (reads on demand)
+//! (owns socket)            (owns Gateway)    (one writer,  ---> mqtt/client     (changes + journal)
+//!    ^                           |            many readers)---> web/server      (snapshot, metrics)
+//!    |                           |                                          |
+//!    +------ frames to send -----+ <-------- Command + reply ---------------+
+//! ```
+//!
+//! ## Rooms, in reading order
+//!
+//! | room | what it knows | may import |
+//! |---|---|---|
+//! | [`time`] | the clock | nothing |
+//! | [`can`] | frames, buses | time |
+//! | [`canopen`] | the CANopen master, pure | `can::frame`, time |
+//! | [`process_image`] | values, quality, status, journal | time, the word `canopen::NmtState` |
+//! | [`mapping`] | what bytes mean; the tag table | `process_image`, canopen ids and settings, `can::BusIndex` |
+//! | [`alarms`] | the alarm list, pure | `process_image`, time |
+//! | [`gateway`] | joins the above, pure but for its task | can, canopen, `process_image`, mapping, alarms, time |
+//! | [`modbus`], [`mqtt`], [`web`] | the process image as registers, topics, pages | `process_image`, mapping, `gateway::command`, time |
+//! | [`simulator`] | pretend devices | can, canopen ids and NMT, time |
+//! | [`config`] | the installation's settings | each room's settings types |
+//! | [`supervisor`] | wires and watches the tasks | every room |
+//! | [`cli`] | one file for each subcommand | every room |
+//!
+//! `tests/architecture.rs` holds this table against the code.
+//!
+//! ## Invariants
+//!
+//! 1. Only `time.rs` reads a clock.
+//! 2. Only files whose first line says \[IO\] touch sockets, files or tokio (and `process_image/handles.rs`, `time.rs`).
+//! 3. Only `gateway/task.rs` holds the [`process_image::ImageWriter`].
+//! 4. Views (modbus, mqtt, web) do not know each other.
+//! 5. Every queue has a bound and says what happens when it is full.
+//! 6. No value without quality and time.
+//! 7. Nothing from a network can panic the process.
+//! 8. Only `canopen` builds frames, and only frames of the kinds that the configuration allows leave.
+//!
+//! ## The seam
+//!
+//! Everything that lives in time has the same four verbs: `handle_*` takes what came in, `handle_timeout` what became
+//! due, `poll_output` gives what is to be done, `poll_timeout` when to come back. One input, then drain, then wait.
+//!
+//! ## Where a change goes
+//!
+//! | to add | touch |
+//! |---|---|
+//! | a device | one file in `mappings/`; no Rust |
+//! | a data type or scaling rule | `mapping/codec.rs`, one variant in `mapping/file.rs` |
+//! | a derived tag | `mapping/table.rs` ([`mapping::Derived`]), `mapping/file.rs`, `gateway/derived.rs` |
+//! | an alarm that needs the gateway's own eyes | [`mapping::BuiltIn`], `gateway/conditions.rs` |
+//! | a northbound | a new room; one field in `config`; one spawn in `supervisor` |
+
+pub mod alarms;
+pub mod can;
+pub mod canopen;
+pub mod cli;
+pub mod config;
+pub mod gateway;
+pub mod mapping;
+pub mod modbus;
+pub mod mqtt;
+pub mod process_image;
+pub mod simulator;
+pub mod supervisor;
+pub mod time;
+pub mod web;

@@ -1,0 +1,24 @@
+//! Device mappings: what the bytes of a device mean, where they stand in the register map, when to raise an alarm.
+//!
+//! Reads text, opens no file. From the mapping files and the installation's buses and nodes it makes one checked,
+//! resolved, immutable [`TagTable`], or a list of [`Diagnostic`]s, all at once, each with file, line, column and hint.
+//!
+//! - `file`: the TOML form of a mapping, as `mappings/README.md` teaches it.
+//! - `installation`: the `[bus.*]` and `[node.*]` tables of the configuration.
+//! - `build`: from both to the tag table; `check`: what must hold.
+//! - [`table`]: the result.
+//! - [`expression`]: conditions on tags.
+//! - `codec`: raw bits to values.
+//! - [`diagnostic`]: messages about files.
+
+pub mod codec;
+pub mod diagnostic;
+pub mod expression;
+pub mod table;
+
+pub use diagnostic::{Diagnostic, Severity, SourceText};
+pub use expression::Expression;
+pub use table::{
+    AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, BusDef, Derived, DeviceDef, Encoding, Field, FieldKind,
+    NodeDef, OnLoss, PublishDef, RegisterDef, Scale, Source, Space, TagDef, TagTable,
+};

@@ -1,0 +1,6 @@
+//! Modbus TCP: the process image as registers and bits (MODBUS Application Protocol V1.1b3).
+//!
+//! - `register_map`: which address shows what; built once from the tag table, immutable.
+//! - `register_bank`: reads registers out of the process image.
+//! - `pdu`: requests and replies, pure; every length is checked before it is used.
+//! - `server` \[IO\]: connections.

@@ -1,0 +1,72 @@
+//! The process image: what is known now, with quality and time, and what happened, in order.
+//!
+//! One writer (the gateway task), many readers (Modbus, MQTT, web). No value is without its quality and the time
+//! at which it was received. Not here: what a tag is called or where it stands in a register map; that is
+//! [`mapping`](crate::mapping)'s table.
+//!
+//! - [`value`], [`quality`]: what a tag holds and how far it can be trusted.
+//! - [`status`]: nodes, buses and alarms as readers see them.
+//! - [`image`]: all of it at one moment.
+//! - [`journal`]: the last events.
+//! - [`handles`]: the writer and the readers (the only file here that knows tokio).
+
+pub mod handles;
+pub mod image;
+pub mod journal;
+pub mod quality;
+pub mod status;
+pub mod value;
+
+pub use handles::{ImageReader, ImageWriter, process_image};
+pub use image::{ProcessImage, Revision};
+pub use journal::{Event, EventKind, Journal};
+pub use quality::{Quality, Reason};
+pub use status::{
+    AlarmState, AlarmStatus, BusState, BusStatus, NodeCounters, NodeStatus, PdoStatus, Priority,
+};
+pub use value::Value;
+
+/// A word of the field that readers need; defined where the protocol is.
+pub use crate::canopen::NmtState;
+use crate::time::{Instant, Timestamp};
+
+/// A tag of some node, by its place in the tag table.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct TagIndex(pub usize);
+
+/// A node, by its place in the tag table.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct NodeIndex(pub usize);
+
+/// An alarm, by its place in the tag table.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct AlarmIndex(pub usize);
+
+/// The last value of a tag.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sample {
+    /// As it stood in the frame: what a raw register shows.
+    pub raw: Value,
+    /// In engineering units. Kept when the quality drops (R-DET-084).
+    pub value: Value,
+    /// How far it can be trusted.
+    pub quality: Quality,
+    /// UTC when the frame was received that carried it.
+    pub received: Timestamp,
+    /// The same on the monotonic clock, for its age; `None` before the first.
+    pub received_at: Option<Instant>,
+    /// When value or quality changed last.
+    pub revision: Revision,
+}
+
+impl Sample {
+    /// A tag of which nothing was ever received.
+    pub const NEVER: Self = Self {
+        raw: Value::Unsigned(0),
+        value: Value::Unsigned(0),
+        quality: Quality::NEVER,
+        received: Timestamp::from_micros(0),
+        received_at: None,
+        revision: Revision(0),
+    };
+}

@@ -1,0 +1,270 @@
+//! What readers see of nodes, buses and alarms, beside the tags.
+
+use super::{NmtState, Revision, Value};
+use crate::time::{Instant, Timestamp};
+
+/// What is known of one node.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct NodeStatus {
+    /// Seen, and not lost since.
+    pub online: bool,
+    /// Why it is not online, or not operational, in words for the operator; empty when all is well.
+    pub reason: String,
+    /// The last NMT state that it reported; `None` before the first.
+    pub nmt: Option<NmtState>,
+    /// Guarding or heartbeat is configured and answered in time.
+    pub supervised: bool,
+    /// Device type or identity is not the configured one.
+    pub identity_mismatch: bool,
+    /// Sends data that a simulator made up.
+    pub simulated: bool,
+    /// The gateway sends nothing to this node's bus.
+    pub passive: bool,
+    /// One entry for each TPDO of the mapping, in its order.
+    pub pdos: Vec<PdoStatus>,
+    /// Counters since the start of the gateway.
+    pub counters: NodeCounters,
+    /// UTC of the newest process data.
+    pub newest_data: Option<Timestamp>,
+    /// Counts up with every change of this node's data: a reader of several blocks can see that they belong together.
+    pub generation: u64,
+    /// When anything of this node changed last.
+    pub revision: Revision,
+}
+
+/// What is known of one TPDO.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PdoStatus {
+    /// TPDO number, 1-based.
+    pub number: u16,
+    /// When it was last received with a usable length.
+    pub last_received: Option<Instant>,
+    /// Did not come in time while it was expected.
+    pub stale: bool,
+    /// Times received with a usable length.
+    pub received: u64,
+}
+
+/// Counters of one node. All saturate; Modbus shows the low 16 bits of most.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct NodeCounters {
+    /// Boot-up messages after the first contact.
+    pub restarts: u64,
+    /// Guard requests without a reply in time.
+    pub guard_misses: u64,
+    /// Guard replies with the wrong toggle bit.
+    pub toggle_errors: u64,
+    /// TPDOs too short or too long.
+    pub pdo_length_errors: u64,
+    /// NMT commands that the gateway sent to this node.
+    pub nmt_commands_sent: u64,
+    /// Emergency messages.
+    pub emcys: u64,
+    /// SDO transfers that failed.
+    pub sdo_errors: u64,
+    /// Reported states that were not ordered, or not defined, and TPDOs in a state that has none.
+    pub unexpected_states: u64,
+    /// Guard replies with a wrong length, or remote and 29-bit frames on this node's identifiers.
+    pub malformed: u64,
+    /// Frames with a bit set that the mapping calls reserved.
+    pub reserved_bits: u64,
+    /// All frames received from this node.
+    pub frames_received: u64,
+}
+
+/// What is known of one bus.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct BusStatus {
+    /// State of the interface and its controller.
+    pub state: BusState,
+    /// Bus load in 0.1 % over the last second; `None` where the bit rate is unknown.
+    pub load_permille: Option<u16>,
+    /// Frames per second, received and sent.
+    pub frames_per_second: u32,
+    /// Frames received since the start.
+    pub frames_received: u64,
+    /// Frames sent since the start.
+    pub frames_sent: u64,
+    /// Frames that could not be sent.
+    pub frames_not_sent: u64,
+    /// Error frames since the start.
+    pub errors: u64,
+    /// Times bus-off.
+    pub bus_off_count: u64,
+    /// Frames that the kernel dropped.
+    pub overruns: u64,
+    /// Frames of identifiers that belong to no configured node, FD and 29-bit frames (R-DET-006).
+    pub foreign_frames: u64,
+}
+
+/// State of a bus as readers see it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub enum BusState {
+    /// No such interface.
+    #[default]
+    Absent,
+    /// Interface down.
+    Down,
+    /// Controller off the bus.
+    BusOff,
+    /// Working with many errors.
+    ErrorPassive,
+    /// Working.
+    ErrorActive,
+}
+
+impl BusState {
+    /// The number in the gateway's register block: 0 absent, 1 down, 2 bus-off, 3 error passive, 4 error active.
+    #[must_use]
+    pub fn code(self) -> u16 {
+        match self {
+            Self::Absent => 0,
+            Self::Down => 1,
+            Self::BusOff => 2,
+            Self::ErrorPassive => 3,
+            Self::ErrorActive => 4,
+        }
+    }
+
+    /// The word in payloads, events and pages.
+    #[must_use]
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Absent => "absent",
+            Self::Down => "down",
+            Self::BusOff => "bus_off",
+            Self::ErrorPassive => "error_passive",
+            Self::ErrorActive => "error_active",
+        }
+    }
+}
+
+/// Priority of an alarm (ISA-18.2); the number is that of the node block's register.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Priority {
+    /// 1
+    Low,
+    /// 2
+    Medium,
+    /// 3
+    High,
+    /// 4
+    Critical,
+}
+
+impl Priority {
+    /// 1 low .. 4 critical.
+    #[must_use]
+    pub fn code(self) -> u16 {
+        match self {
+            Self::Low => 1,
+            Self::Medium => 2,
+            Self::High => 3,
+            Self::Critical => 4,
+        }
+    }
+
+    /// The word in payloads, events and pages.
+    #[must_use]
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Low => "low",
+            Self::Medium => "medium",
+            Self::High => "high",
+            Self::Critical => "critical",
+        }
+    }
+}
+
+/// State of an alarm (ISA-18.2, IEC 62682).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum AlarmState {
+    /// A: nothing to tell.
+    #[default]
+    Normal,
+    /// B: active, nobody has acknowledged it.
+    Unacknowledged,
+    /// C: active, acknowledged.
+    Acknowledged,
+    /// D: came and went, nobody has acknowledged it.
+    ReturnedUnacknowledged,
+    /// E: a latching alarm whose cause has gone, not acknowledged.
+    LatchedUnacknowledged,
+    /// F: a latching alarm whose cause has gone, acknowledged, waits for a reset.
+    LatchedAcknowledged,
+    /// G: put aside by an operator until a set time.
+    Shelved,
+    /// H: suppressed by design, because another alarm tells the cause.
+    Suppressed,
+    /// I: out of service.
+    OutOfService,
+}
+
+impl AlarmState {
+    /// The word in payloads, events and pages.
+    #[must_use]
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Normal => "normal",
+            Self::Unacknowledged => "unacknowledged",
+            Self::Acknowledged => "acknowledged",
+            Self::ReturnedUnacknowledged => "returned_unacknowledged",
+            Self::LatchedUnacknowledged => "latched_unacknowledged",
+            Self::LatchedAcknowledged => "latched_acknowledged",
+            Self::Shelved => "shelved",
+            Self::Suppressed => "suppressed",
+            Self::OutOfService => "out_of_service",
+        }
+    }
+
+    /// The number in the event ring: 0 normal .. 8 out of service, in the order of this enum.
+    #[must_use]
+    pub fn code(self) -> u16 {
+        match self {
+            Self::Normal => 0,
+            Self::Unacknowledged => 1,
+            Self::Acknowledged => 2,
+            Self::ReturnedUnacknowledged => 3,
+            Self::LatchedUnacknowledged => 4,
+            Self::LatchedAcknowledged => 5,
+            Self::Shelved => 6,
+            Self::Suppressed => 7,
+            Self::OutOfService => 8,
+        }
+    }
+
+    /// Counts as active for readers: its condition holds, or it is latched.
+    #[must_use]
+    pub fn is_active(self) -> bool {
+        matches!(
+            self,
+            Self::Unacknowledged
+                | Self::Acknowledged
+                | Self::LatchedUnacknowledged
+                | Self::LatchedAcknowledged
+        )
+    }
+
+    /// Waits for an acknowledgement.
+    #[must_use]
+    pub fn is_unacknowledged(self) -> bool {
+        matches!(self, Self::Unacknowledged | Self::ReturnedUnacknowledged | Self::LatchedUnacknowledged)
+    }
+}
+
+/// What is known of one alarm.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct AlarmStatus {
+    /// Its state.
+    pub state: AlarmState,
+    /// When the state was entered; `None` while it never left normal.
+    pub since: Option<Timestamp>,
+    /// Times raised since the start.
+    pub count: u64,
+    /// It was the first of its group to be raised since the group was last quiet.
+    pub first_out: bool,
+    /// The value that raised it, where the condition has one.
+    pub value: Option<Value>,
+    /// When it changed last.
+    pub revision: Revision,
+}

@@ -1,0 +1,1 @@
+//! HTTP: status page, health and metrics. Reads the process image; writes nothing.

@@ -1,0 +1,43 @@
+//! The tests that see more than one room. One binary, one table of contents.
+//!
+//! | file | what is proved |
+//! |---|---|
+//! | `architecture` | which room may import which; file sizes; what the pure rooms must not touch |
+//! | `conversations` | the gateway core against scripted frames, in candump notation |
+//! | `devices` | the gateway core against our simulators, with loss, delay and duplicates |
+//! | `mappings` | every shipped mapping checks; every message about a wrong one says what, where and how to mend it |
+//! | `contract` | golden files: register map, topics, payloads. Never edited to pass |
+//! | `modbus_server` | the Modbus TCP server over loopback sockets |
+//! | `mqtt_client` | the MQTT client against good, slow and hostile brokers |
+//! | `web_server` | health, metrics, page |
+//! | `lifecycle` | the program as a process: start, stop, exit codes |
+//! | `properties` | random input: no panic, no torn value |
+//!
+//! Tests on a real CAN bus are in `tests/vcan`, those of the container in `tests/container`.
+
+#![allow(
+    clippy::allow_attributes,
+    clippy::as_conversions,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    clippy::panic,
+    clippy::print_stderr,
+    clippy::print_stdout,
+    clippy::too_many_lines,
+    clippy::unwrap_used,
+    clippy::wildcard_enum_match_arm,
+    dead_code,
+    reason = "a test may fail loudly; helpers in `support` are not used by every test"
+)]
+
+mod architecture;
+mod contract;
+mod conversations;
+mod devices;
+mod lifecycle;
+mod mappings;
+mod modbus_server;
+mod mqtt_client;
+mod properties;
+mod support;
+mod web_server;
