@@ -4,16 +4,18 @@
 //!
 //! - [`frame`]: classical CAN frames, pure.
 //! - this file: [`BusEvent`] and the [`CanBus`] trait, the seam between a bus and the gateway.
-//! - `interface`: how an interface is written (`can0`, `virtual:demo`, `slcan:/dev/ttyACM0`).
+//! - [`interface`]: how an interface is written (`can0`, `virtual:demo`, `slcan:/dev/ttyACM0`).
 //! - `socketcan`, `virtual_bus`, `slcan` \[IO\]: the three kinds of bus.
 //! - `task` \[IO\]: owns one bus: opens, reads, writes, reopens, counts.
 //! - `recording`: candump logs.
 
 pub mod frame;
+pub mod interface;
 
 use std::future::Future;
 
 pub use frame::{CanFrame, CanId, ParseFrameError};
+pub use interface::{Interface, ParseInterfaceError};
 
 use crate::time::Now;
 
