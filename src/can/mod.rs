@@ -5,15 +5,17 @@
 //! - [`frame`]: classical CAN frames, pure.
 //! - this file: [`BusEvent`] and the [`CanBus`] trait, the seam between a bus and the gateway.
 //! - [`interface`]: how an interface is written (`can0`, `virtual:demo`, `slcan:/dev/ttyACM0`).
-//! - `socketcan`, `virtual_bus`, `slcan` \[IO\]: the three kinds of bus.
-//! - `task` \[IO\]: owns one bus: opens, reads, writes, reopens, counts.
-//! - `recording`: candump logs.
+//! - [`bus`] \[IO\]: [`open`] any interface.
+//! - [`virtual_bus`] \[IO\]: buses inside the process.
 
+pub mod bus;
 pub mod frame;
 pub mod interface;
+pub mod virtual_bus;
 
 use std::future::Future;
 
+pub use bus::{AnyBus, open};
 pub use frame::{CanFrame, CanId, ParseFrameError};
 pub use interface::{Interface, ParseInterfaceError};
 
@@ -103,19 +105,65 @@ pub struct BusCounters {
     pub bit_rate: Option<u32>,
 }
 
-/// One way to reach a CAN bus. The only IO trait of the crate: tests put a simulated bus behind it.
+/// What a reader has counted since its bus was opened.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Tally {
+    /// As [`BusCounters::error_frames`].
+    pub error_frames: u64,
+    /// As [`BusCounters::fd_frames`].
+    pub fd_frames: u64,
+    /// As [`BusCounters::overruns`].
+    pub overruns: u64,
+    /// As [`BusCounters::bit_rate`].
+    pub bit_rate: Option<u32>,
+}
+
+/// An open CAN bus. The only IO trait of the crate: tests put a simulated bus behind it.
+///
+/// It falls into two halves, so that receiving never waits for sending.
 pub trait CanBus: Send {
-    /// Waits for what happens next. Cancel-safe: dropping the future loses no frame.
+    /// The receiving half.
+    type Reader: BusReader;
+    /// The sending half.
+    type Writer: BusWriter;
+
+    /// The two halves. The bus is closed when both are dropped.
+    fn split(self) -> (Self::Reader, Self::Writer);
+}
+
+/// The receiving half of a bus.
+pub trait BusReader: Send {
+    /// Waits for what happens next: frames, and changes of the link. The first event of a bus that has just been
+    /// opened says how its link is; before that it may not be usable. Counters are in [`BusReader::tally`].
+    ///
+    /// Cancel-safe: dropping the future loses no frame.
     ///
     /// # Errors
     /// The bus is unusable and has to be opened again.
     fn recv(&mut self) -> impl Future<Output = Result<BusEvent, BusError>> + Send;
 
+    /// What was counted since the bus was opened.
+    fn tally(&self) -> Tally {
+        Tally::default()
+    }
+}
+
+/// The sending half of a bus.
+pub trait BusWriter: Send {
     /// Sends a frame, or gives up after a short time; never queues behind a dead bus.
     ///
     /// # Errors
     /// The frame did not leave.
     fn send(&mut self, frame: &CanFrame) -> impl Future<Output = Result<(), BusError>> + Send;
+}
+
+impl<R: BusReader, W: BusWriter> CanBus for (R, W) {
+    type Reader = R;
+    type Writer = W;
+
+    fn split(self) -> (R, W) {
+        self
+    }
 }
 
 /// Why a bus could not be used. Printed once, by the task that owns it.

@@ -1,0 +1,95 @@
+//! Opens any kind of interface. \[IO\]
+
+use super::interface::Interface;
+use super::virtual_bus::{self, VirtualReader, VirtualWriter};
+use super::{BusError, BusEvent, BusReader, BusWriter, CanBus, CanFrame, Tally};
+use crate::time::Clock;
+
+/// An open bus of any kind.
+#[derive(Debug)]
+pub struct AnyBus {
+    reader: AnyReader,
+    writer: AnyWriter,
+}
+
+/// The receiving half of [`AnyBus`].
+#[derive(Debug)]
+pub enum AnyReader {
+    /// A bus inside the process.
+    Virtual(VirtualReader),
+}
+
+/// The sending half of [`AnyBus`].
+#[derive(Debug)]
+pub enum AnyWriter {
+    /// A bus inside the process.
+    Virtual(VirtualWriter),
+}
+
+/// Opens an interface. Must be called inside a tokio runtime.
+///
+/// Opening does not wait: a bus that takes time to be usable says so by its first event, its [`Link`](super::Link).
+///
+/// # Errors
+/// The interface is not there, or the system refuses it.
+pub fn open(interface: &Interface, clock: Clock) -> Result<AnyBus, BusError> {
+    match interface {
+        Interface::Virtual(name) => {
+            let (reader, writer) = virtual_bus::join(name, clock).split();
+            Ok(AnyBus { reader: AnyReader::Virtual(reader), writer: AnyWriter::Virtual(writer) })
+        }
+        Interface::SocketCan(_) | Interface::Slcan { .. } | Interface::SlcanTcp { .. } => Err(BusError::Io {
+            interface: interface.to_string(),
+            source: std::io::Error::from(std::io::ErrorKind::Unsupported),
+        }),
+    }
+}
+
+impl AnyBus {
+    /// Waits for what happens next, as [`BusReader::recv`].
+    ///
+    /// # Errors
+    /// The bus is unusable and has to be opened again.
+    pub async fn recv(&mut self) -> Result<BusEvent, BusError> {
+        self.reader.recv().await
+    }
+
+    /// Sends a frame, as [`BusWriter::send`].
+    ///
+    /// # Errors
+    /// The frame did not leave.
+    pub async fn send(&mut self, frame: &CanFrame) -> Result<(), BusError> {
+        self.writer.send(frame).await
+    }
+}
+
+impl CanBus for AnyBus {
+    type Reader = AnyReader;
+    type Writer = AnyWriter;
+
+    fn split(self) -> (AnyReader, AnyWriter) {
+        (self.reader, self.writer)
+    }
+}
+
+impl BusReader for AnyReader {
+    async fn recv(&mut self) -> Result<BusEvent, BusError> {
+        match self {
+            Self::Virtual(reader) => reader.recv().await,
+        }
+    }
+
+    fn tally(&self) -> Tally {
+        match self {
+            Self::Virtual(reader) => reader.tally(),
+        }
+    }
+}
+
+impl BusWriter for AnyWriter {
+    async fn send(&mut self, frame: &CanFrame) -> Result<(), BusError> {
+        match self {
+            Self::Virtual(writer) => writer.send(frame).await,
+        }
+    }
+}
