@@ -4,18 +4,24 @@
 //! resolved, immutable [`TagTable`], or a list of [`Diagnostic`]s, all at once, each with file, line, column and hint.
 //!
 //! - `file`: the TOML form of a mapping, as `mappings/README.md` teaches it.
-//! - `installation`: the `[bus.*]` and `[node.*]` tables of the configuration.
+//! - [`installation`]: the `[bus.*]` and `[node.*]` tables of the configuration.
 //! - `build`: from both to the tag table; `check`: what must hold.
 //! - [`table`]: the result.
-//! - [`expression`]: conditions on tags.
+//! - [`expression`]: conditions on tags; `expression_parser` reads them.
 //! - `codec`: raw bits to values.
-//! - [`diagnostic`]: messages about files.
+//! - [`diagnostic`]: messages about files. `reader`: strict TOML; `suggest`: "did you mean".
 
+mod at;
 pub mod codec;
 pub mod diagnostic;
 pub mod expression;
+pub mod expression_parser;
+pub mod installation;
+pub mod reader;
+pub mod suggest;
 pub mod table;
 
+pub use at::At;
 pub use diagnostic::{Diagnostic, Severity, SourceText};
 pub use expression::Expression;
 pub use table::{

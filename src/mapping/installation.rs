@@ -1,0 +1,235 @@
+//! The `[bus.*]` and `[node.*]` tables of the configuration.
+//!
+//! Numbers are read wide and checked by [`build`](super::build()), so that a value out of its range is told together with all
+//! other problems. `None` means "what the mapping says, else the default".
+
+use std::collections::BTreeMap;
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use super::At;
+use super::table::OnLoss;
+use crate::canopen::{Role, TogglePolicy};
+use crate::process_image::Priority;
+
+/// `[bus.NAME]`.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct BusEntry {
+    /// How the bus is reached: `can0`, `virtual:demo`, `slcan:/dev/ttyACM0?bitrate=125000`, `slcan+tcp://host:port`.
+    pub interface: At<String>,
+    /// Whether the gateway is the NMT master of this bus or sends nothing at all. Default: master.
+    #[serde(default)]
+    pub role: RoleWord,
+    /// Bit rate in bit/s, for the bus load: 10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000 or 1000000.
+    /// Default: 125000 (R-DET-089).
+    pub bit_rate: Option<At<u64>>,
+    /// Start all nodes of the bus with one broadcast command instead of one by one (R-DET-018). Default: false.
+    #[serde(default)]
+    pub start_broadcast: bool,
+    /// The gateway's own node id, 1..=127, where it has one: no node of this bus may use it (R-DET-004).
+    pub own_node_id: Option<At<u64>>,
+}
+
+/// `role`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum RoleWord {
+    /// NMT master: starts and guards its nodes.
+    #[default]
+    Master,
+    /// Sends nothing at all.
+    Passive,
+}
+
+impl From<RoleWord> for Role {
+    fn from(word: RoleWord) -> Self {
+        match word {
+            RoleWord::Master => Self::Master,
+            RoleWord::Passive => Self::Passive,
+        }
+    }
+}
+
+/// `[node.NAME]`.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct NodeEntry {
+    /// Name of its bus.
+    pub bus: At<String>,
+    /// CANopen node id, 1..=127. It has no default (R-DET-005).
+    pub id: At<u64>,
+    /// Device mapping: the name of a file in `mappings/`, or a path.
+    pub mapping: At<String>,
+    /// Modbus unit id, 1..=246. Default: the node id.
+    pub unit_id: Option<At<u64>>,
+    /// Added to every Modbus address, so that several nodes can share one unit id. Default: 0.
+    pub offset: Option<At<u64>>,
+    /// What Modbus shows of invalid data. Default: invalid.
+    #[serde(default)]
+    pub on_loss: OnLossWord,
+    /// Show 0 instead of the last value when a value is not usable (R-DET-084). Default: false.
+    #[serde(default)]
+    pub zero_on_bad: bool,
+    /// Values for the parameters that the mapping declares.
+    #[serde(default)]
+    pub parameters: BTreeMap<At<String>, At<f64>>,
+    /// How the life of the node is watched (R-DET-044).
+    pub error_control: Option<ErrorControlWord>,
+    /// Time between two guard requests, 20..=65535 ms; 0 = guarding off (R-DET-031).
+    pub guard_time_ms: Option<At<u64>>,
+    /// Missed replies in a row until the node is lost, 1..=255 (R-DET-032).
+    pub life_time_factor: Option<At<u64>>,
+    /// A guard reply later than this is missed; at most the guard time (R-DET-033).
+    pub guard_reply_ms: Option<At<u64>>,
+    /// What a wrong toggle bit means (R-DET-035).
+    pub toggle_check: Option<ToggleWord>,
+    /// A heartbeat node is lost after this long without a sign of life, 10..=65535 ms (R-DET-044).
+    pub heartbeat_timeout_ms: Option<At<u64>>,
+    /// Start the node whenever it waits for it (R-DET-017).
+    pub auto_start: Option<bool>,
+    /// Start at the latest this long after a boot-up message, 0..=65535 ms (R-DET-019).
+    pub start_delay_ms: Option<At<u64>>,
+    /// A start without effect for this long is repeated, 10..=65535 ms (R-DET-020).
+    pub start_confirm_ms: Option<At<u64>>,
+    /// Time between repeated starts, 10..=65535 ms (R-DET-020).
+    pub start_retry_ms: Option<At<u64>>,
+    /// Send reset node when a lost node comes back (R-DET-016).
+    pub reset_on_recovery: Option<bool>,
+    /// For every TPDO of the node: stale after this long, 10..=3600000 ms; 0 = not supervised (R-DET-082).
+    pub pdo_timeout_ms: Option<At<u64>>,
+    /// For every TPDO of the node: discard frames that are too long (R-DET-081).
+    pub strict_dlc: Option<bool>,
+    /// Changes to tags of the mapping.
+    #[serde(default)]
+    pub tag: BTreeMap<At<String>, TagEntry>,
+    /// Changes to alarms, of the mapping or built in.
+    #[serde(default)]
+    pub alarm: BTreeMap<At<String>, AlarmEntry>,
+}
+
+/// `[node.NAME.tag.TAG]`: what this installation changes of a tag.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TagEntry {
+    /// Invert all its bits (R-DET-051); tags of a TPDO only.
+    pub invert: Option<At<bool>>,
+    /// Order of its bytes (R-DET-050); tags of a TPDO only.
+    pub byte_order: Option<At<ByteOrderWord>>,
+    /// A smaller change is not published by itself; in engineering units.
+    pub deadband: Option<At<f64>>,
+    /// One sentence.
+    pub description: Option<String>,
+}
+
+/// `[node.NAME.alarm.ALARM]`: what this installation changes of an alarm.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct AlarmEntry {
+    /// Off: the condition is never raised.
+    pub enabled: Option<bool>,
+    /// How urgent.
+    pub priority: Option<PriorityWord>,
+    /// The condition must hold this long, 0..=86400000 ms.
+    pub on_delay_ms: Option<At<u64>>,
+    /// The condition must be gone this long, 0..=86400000 ms.
+    pub off_delay_ms: Option<At<u64>>,
+    /// Stay until acknowledged and reset.
+    pub latch: Option<bool>,
+}
+
+/// `on_loss`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OnLossWord {
+    /// A value that cannot be mistaken: 0xFFFF, 0x8000, NaN.
+    #[default]
+    Invalid,
+    /// The last value; the status word tells.
+    Hold,
+    /// Exception 0x0B for a range that touches invalid data.
+    Exception,
+}
+
+impl From<OnLossWord> for OnLoss {
+    fn from(word: OnLossWord) -> Self {
+        match word {
+            OnLossWord::Invalid => Self::Invalid,
+            OnLossWord::Hold => Self::Hold,
+            OnLossWord::Exception => Self::Exception,
+        }
+    }
+}
+
+/// How the life of a node is watched.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ErrorControlWord {
+    /// The gateway asks by remote frame.
+    #[default]
+    Guarding,
+    /// The node tells by itself.
+    Heartbeat,
+    /// Not at all.
+    None,
+}
+
+/// What a wrong toggle bit means.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ToggleWord {
+    /// As if the reply had not come.
+    #[default]
+    Strict,
+    /// Counted, but accepted.
+    Warn,
+    /// Not looked at.
+    Off,
+}
+
+impl From<ToggleWord> for TogglePolicy {
+    fn from(word: ToggleWord) -> Self {
+        match word {
+            ToggleWord::Strict => Self::Strict,
+            ToggleWord::Warn => Self::Warn,
+            ToggleWord::Off => Self::Off,
+        }
+    }
+}
+
+/// Order of the bytes of a field.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ByteOrderWord {
+    /// Least significant byte first, as CANopen does.
+    #[default]
+    Little,
+    /// Most significant byte first.
+    Big,
+}
+
+/// How urgent an alarm is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum PriorityWord {
+    /// To be seen in time.
+    Low,
+    /// To be acted on soon.
+    Medium,
+    /// To be acted on at once.
+    High,
+    /// Damage or danger.
+    Critical,
+}
+
+impl From<PriorityWord> for Priority {
+    fn from(word: PriorityWord) -> Self {
+        match word {
+            PriorityWord::Low => Self::Low,
+            PriorityWord::Medium => Self::Medium,
+            PriorityWord::High => Self::High,
+            PriorityWord::Critical => Self::Critical,
+        }
+    }
+}
