@@ -8,6 +8,8 @@
 //! | `mappings` | every shipped mapping checks; every message about a wrong one says what, where and how to mend it |
 //! | `contract` | golden files: register map, topics, payloads. Never edited to pass |
 //! | `modbus_server` | the Modbus TCP server over loopback sockets |
+//! | `contract_mqtt` | golden files: topics and payloads. Never edited to pass |
+//! | `mqtt_publisher` | what is published when |
 //! | `mqtt_client` | the MQTT client against good, slow and hostile brokers |
 //! | `web_server` | health, metrics, page |
 //! | `lifecycle` | the program as a process: start, stop, exit codes |
@@ -32,12 +34,14 @@
 
 mod architecture;
 mod contract;
+mod contract_mqtt;
 mod conversations;
 mod devices;
 mod lifecycle;
 mod mappings;
 mod modbus_server;
 mod mqtt_client;
+mod mqtt_publisher;
 mod properties;
 mod support;
 mod web_server;

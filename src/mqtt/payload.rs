@@ -1,0 +1,278 @@
+//! Contents of the topics, version 1. Members may be added; none changes its meaning or leaves.
+
+use super::json::{JsonWriter, is_representable};
+use super::outbox::OutboxReport;
+use crate::mapping::{AlarmDef, TagDef, TagTable};
+use crate::process_image::{
+    AlarmStatus, Event, NmtState, NodeIndex, NodeStatus, Priority, ProcessImage, Quality, Sample, TagIndex,
+    Value,
+};
+use crate::time::{Now, Timestamp};
+
+/// What does not change while the program runs.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Identity {
+    /// Stream id: made new at every start; `sid` and `seq` together name a message for ever.
+    pub sid: String,
+    /// Version of the program.
+    pub version: String,
+    /// Version of the register map's layout.
+    pub map_version: u32,
+    /// Hash of the register map, in hexadecimal.
+    pub map_hash: String,
+    /// When the program started.
+    pub started: Now,
+}
+
+/// Which message of its stream this is.
+#[derive(Clone, Copy, Debug)]
+pub struct Stamp<'a> {
+    /// Stream id.
+    pub sid: &'a str,
+    /// Counts up by one with every message of its topic.
+    pub seq: u64,
+}
+
+/// `bridge/state` while a session is up.
+pub const ONLINE: &str = r#"{"state":"online"}"#;
+/// `bridge/state` when the gateway stopped, or by last will.
+pub const OFFLINE: &str = r#"{"state":"offline"}"#;
+
+/// Reason of a value that its own device calls meaningless: the tag that tells so is false (R-DET-086).
+pub const NOT_VALID: &str = "not_valid";
+/// Reason of a value that is no number.
+pub const NOT_A_NUMBER: &str = "not_a_number";
+
+/// `<node>/state`: all published tags of a node.
+pub fn state(out: &mut String, table: &TagTable, image: &ProcessImage, node: NodeIndex, stamp: Stamp<'_>) {
+    let Some(def) = table.node(node) else { return };
+    let status = image.node(node);
+    let published = || {
+        let tags = table.tags.get(def.tags.clone()).unwrap_or_default();
+        let places = def.tags.clone().map(TagIndex);
+        places.zip(tags).filter(|(_, tag)| tag.published).map(|(index, tag)| (tag, image.tag(index)))
+    };
+    let quality = published().map(|(_, sample)| sample.quality).max().unwrap_or(Quality::Good);
+    let mut json = JsonWriter::object(out);
+    json.integer("v", 1);
+    json.optional_integer("ts", status.and_then(|status| status.newest_data).map(Timestamp::as_millis));
+    json.text("sid", stamp.sid);
+    json.integer("seq", stamp.seq);
+    json.text("quality", quality.word());
+    json.optional_text("nmt", status.and_then(|status| status.nmt).map(NmtState::word));
+    json.nested("tags", |tags| {
+        for (tag, sample) in published() {
+            tags.value(&tag.name, shown(sample, def.zero_on_bad), tag.decimals);
+        }
+    });
+    json.nested("bad", |bad| {
+        for (tag, sample) in published() {
+            if let Some(reason) = reason(image, tag, sample) {
+                bad.text(&tag.name, reason);
+            }
+        }
+    });
+    json.finish();
+}
+
+/// The value to show: nothing where nothing was ever received; the last one otherwise, or 0 where the installation
+/// asks for it (R-DET-084).
+fn shown(sample: &Sample, zero_on_bad: bool) -> Option<Value> {
+    if sample.quality.is_usable() {
+        Some(sample.value)
+    } else if zero_on_bad {
+        Some(match sample.value {
+            Value::Bool(_) => Value::Bool(false),
+            Value::Unsigned(_) | Value::Signed(_) | Value::Float(_) => Value::Unsigned(0),
+        })
+    } else {
+        sample.received_at.map(|_| sample.value)
+    }
+}
+
+/// Why a value should not be used as it stands; `None` for a good one.
+fn reason(image: &ProcessImage, tag: &TagDef, sample: &Sample) -> Option<&'static str> {
+    if let Some(reason) = sample.quality.reason() {
+        return Some(reason.word());
+    }
+    if tag.valid.is_some_and(|valid| !image.tag(valid).value.is_true()) {
+        return Some(NOT_VALID);
+    }
+    (!is_representable(sample.value)).then_some(NOT_A_NUMBER)
+}
+
+/// `<node>/availability`.
+pub fn availability(out: &mut String, status: &NodeStatus) {
+    if status.online {
+        out.clear();
+        out.push_str(ONLINE);
+        return;
+    }
+    let reason = if status.reason.is_empty() { "not seen yet" } else { &status.reason };
+    let mut json = JsonWriter::object(out);
+    json.text("state", "offline");
+    json.text("reason", reason);
+    json.finish();
+}
+
+/// `<node>/alarm/<alarm>` and `bridge/alarm/...`.
+pub fn alarm(out: &mut String, table: &TagTable, def: &AlarmDef, status: &AlarmStatus) {
+    let mut json = JsonWriter::object(out);
+    json.integer("v", 1);
+    json.text("state", status.state.word());
+    json.bool("active", status.state.is_active());
+    json.bool("acknowledged", !status.state.is_unacknowledged());
+    json.text("priority", def.priority.word());
+    json.optional_integer("ts", status.since.map(Timestamp::as_millis));
+    json.integer("count", status.count);
+    json.bool("first_out", status.first_out);
+    json.value("value", status.value, decimals_of(table, def.value));
+    json.text("text", &def.text);
+    json.text("action", &def.action);
+    json.finish();
+}
+
+/// `event`: one entry of the journal.
+pub fn event(out: &mut String, table: &TagTable, event: &Event, sid: &str) {
+    let alarm = event.alarm.and_then(|alarm| table.alarms.get(alarm.0));
+    let mut json = JsonWriter::object(out);
+    json.integer("v", 1);
+    json.text("sid", sid);
+    json.integer("seq", event.seq);
+    json.integer("ts", event.ts.as_millis());
+    json.text("kind", event.kind.word());
+    json.optional_text("node", event.node.as_deref());
+    json.optional_text("bus", event.bus.as_deref());
+    json.text("name", &event.name);
+    json.text("from", &event.from);
+    json.text("to", &event.to);
+    json.optional_text("priority", event.priority.map(Priority::word));
+    json.value("value", event.value, decimals_of(table, alarm.and_then(|alarm| alarm.value)));
+    json.text("text", &event.text);
+    json.finish();
+}
+
+/// In place of events that left the journal before they could be read: the number of the last of them, and how many.
+pub fn events_missed(out: &mut String, sid: &str, last: u64, missed: u64, at: Timestamp) {
+    let mut json = JsonWriter::object(out);
+    json.integer("v", 1);
+    json.text("sid", sid);
+    json.integer("seq", last);
+    json.integer("ts", at.as_millis());
+    json.text("kind", "gateway");
+    json.null("node");
+    json.null("bus");
+    json.text("name", "events_missed");
+    json.text("from", "");
+    json.text("to", "");
+    json.null("priority");
+    json.integer("value", missed);
+    json.text("text", "More events came at once than the journal holds; the oldest were lost.");
+    json.finish();
+}
+
+/// Digits after the decimal point of an alarm's value.
+fn decimals_of(table: &TagTable, tag: Option<TagIndex>) -> u8 {
+    tag.and_then(|tag| table.tag(tag)).map_or(3, |tag| tag.decimals)
+}
+
+/// `bridge/info`: what this gateway is and what belongs to it.
+pub fn info(out: &mut String, table: &TagTable, identity: &Identity) {
+    let mut json = JsonWriter::object(out);
+    json.integer("v", 1);
+    json.text("gateway", &table.gateway);
+    json.text("software", "cangate");
+    json.text("version", &identity.version);
+    json.text("sid", &identity.sid);
+    json.integer("started", identity.started.utc.as_millis());
+    json.integer("map_version", identity.map_version);
+    json.text("map_hash", &identity.map_hash);
+    json.array("buses", |buses| {
+        for bus in &table.buses {
+            buses.element(|json| {
+                json.text("name", &bus.name);
+                json.integer("bit_rate", bus.bit_rate);
+            });
+        }
+    });
+    json.array("nodes", |nodes| {
+        for node in &table.nodes {
+            nodes.element(|json| {
+                json.text("name", &node.name);
+                json.optional_text("bus", table.buses.get(node.bus.0).map(|bus| bus.name.as_str()));
+                json.integer("id", node.canopen.id.get());
+                json.integer("unit_id", node.unit_id);
+                json.text("mapping", &node.device.mapping);
+                json.text("vendor", &node.device.vendor);
+                json.text("model", &node.device.model);
+            });
+        }
+    });
+    json.finish();
+}
+
+/// `bridge/health`: counters, and how much the outbox can still take.
+pub fn health(
+    out: &mut String,
+    table: &TagTable,
+    image: &ProcessImage,
+    identity: &Identity,
+    now: Now,
+    outbox: &OutboxReport,
+) {
+    let uptime = now.instant.since(identity.started.instant);
+    let count =
+        |what: fn(&AlarmStatus) -> bool| number(image.alarms.iter().filter(|alarm| what(alarm)).count());
+    let mut json = JsonWriter::object(out);
+    json.integer("v", 1);
+    json.integer("ts", now.utc.as_millis());
+    json.integer("uptime_s", uptime.as_secs());
+    json.bool("clock_synchronised", image.clock_synchronised);
+    json.integer("nodes_configured", number(image.nodes.len()));
+    json.integer("nodes_online", number(image.nodes.iter().filter(|node| node.online).count()));
+    json.integer("alarms_active", count(|alarm| alarm.state.is_active()));
+    json.integer("alarms_unacknowledged", count(|alarm| alarm.state.is_unacknowledged()));
+    json.array("buses", |buses| {
+        for (def, bus) in table.buses.iter().zip(&image.buses) {
+            buses.element(|json| {
+                json.text("name", &def.name);
+                json.text("state", bus.state.word());
+                let percent = bus.load_permille.map(|permille| Value::Float(f64::from(permille) / 10.0));
+                json.value("load_percent", percent, 1);
+                json.integer("frames_per_second", bus.frames_per_second);
+                json.integer("frames_received", bus.frames_received);
+                json.integer("frames_sent", bus.frames_sent);
+                json.integer("frames_not_sent", bus.frames_not_sent);
+                json.integer("errors", bus.errors);
+                json.integer("bus_off_count", bus.bus_off_count);
+                json.integer("overruns", bus.overruns);
+                json.integer("foreign_frames", bus.foreign_frames);
+            });
+        }
+    });
+    json.nested("outbox", |json| outbox_members(json, outbox, uptime.as_secs()));
+    json.finish();
+}
+
+fn outbox_members(json: &mut JsonWriter<'_>, outbox: &OutboxReport, uptime_s: u64) {
+    json.integer("messages", number(outbox.messages));
+    json.integer("messages_limit", number(outbox.messages_limit));
+    json.integer("bytes", number(outbox.bytes));
+    json.integer("bytes_limit", number(outbox.bytes_limit));
+    json.value("hours_left", outbox.hours_left(uptime_s).map(Value::Float), 1);
+    json.integer("sent", outbox.sent);
+    json.integer("sent_again", outbox.sent_again);
+    json.integer("acknowledged", outbox.acknowledged);
+    json.integer("superseded", outbox.superseded);
+    json.integer("too_large", outbox.too_large);
+    json.integer("events_missed", outbox.events_missed);
+    json.nested("dropped", |json| {
+        for (class, dropped) in outbox.dropped() {
+            json.integer(class.word(), dropped);
+        }
+    });
+}
+
+fn number(count: usize) -> u64 {
+    u64::try_from(count).unwrap_or(u64::MAX)
+}
