@@ -35,12 +35,12 @@ pub enum NodeEvent {
         /// Whether it was thrown away.
         discarded: bool,
     },
-    /// A supervised TPDO did not come in time (R-DET-082).
+    /// A supervised TPDO did not come in time (R-DET-082); told once until it comes again.
     PdoTimeout {
         /// Which.
         pdo: PdoIndex,
     },
-    /// A TPDO came while the node was believed not operational (R-DET-083).
+    /// A TPDO came while the node was known not to be operational and no start command explains it (R-DET-083).
     PdoInUnexpectedState {
         /// Which.
         pdo: PdoIndex,
@@ -51,18 +51,20 @@ pub enum NodeEvent {
     Seen,
     /// No frame at all since the gateway started (R-DET-001).
     NeverSeen,
-    /// The state changed. `ordered`: by the gateway itself, or the normal end of initialisation.
+    /// The believed state changed: by report, or because a TPDO came (R-DET-083). A TPDO's own event follows.
     State {
         /// Believed state before.
         from: Option<NmtState>,
         /// State now.
         to: NmtState,
-        /// Whether the gateway asked for it.
+        /// `false`: an unexpected change (R-DET-038). `true` for the first state ever, the effect of an NMT command of the
+        /// gateway (in the passive role: of an overheard one), the end of initialisation, and a boot-up message, of which
+        /// `Restarted` tells whether it was asked for.
         ordered: bool,
     },
-    /// A boot-up message from a node that was running (R-DET-039): its data is stale.
+    /// A boot-up message that no ordered reset explains, from a node that was running (R-DET-039): its data is stale.
     Restarted,
-    /// A state code that CiA 301 does not define (R-DET-041); reported once per change.
+    /// A state code that CiA 301 does not define (R-DET-041); reported once per change. The known state stays.
     InvalidState {
         /// Bits 6..0 of the reply.
         raw: u8,
@@ -84,12 +86,13 @@ pub enum NodeEvent {
     },
     /// A valid reply, heartbeat or boot-up ended the loss (R-DET-037).
     Recovered,
-    /// A non-zero state frame nobody had asked for (R-DET-045); reported once.
+    /// A non-zero state frame nobody had asked for, or after the reply deadline (R-DET-045); reported once.
     UnsolicitedState,
     /// Somebody else sends guard requests to this node (R-DET-043); reported once until 60 s of silence.
     ForeignGuardMaster,
-    /// A frame on the error control identifier with a wrong length (R-DET-042), or a remote or 29-bit frame on one of
-    /// the node's identifiers (R-DET-006): ignored.
+    /// A frame on the error control identifier with a wrong length (R-DET-042), of which the first byte counts if there
+    /// is one; or an emergency message that is too short, or a remote or 29-bit frame on one of the node's identifiers
+    /// (R-DET-006), which are ignored.
     Malformed {
         /// The frame.
         frame: CanFrame,
@@ -99,7 +102,7 @@ pub enum NodeEvent {
         /// Which.
         request: NmtRequest,
     },
-    /// Three start commands had no effect (R-DET-020).
+    /// Three start commands had no effect (R-DET-020); told once until the node is operational. Starting goes on.
     StartFailed {
         /// Start commands sent so far.
         attempts: u32,
@@ -115,15 +118,15 @@ pub enum NodeEvent {
         /// Manufacturer bytes.
         vendor: [u8; 5],
     },
-    /// Two nodes seem to share this id: TPDOs far too often, boot-up messages while TPDOs go on, toggle errors with all
-    /// requests answered twice.
+    /// Two nodes seem to share this id: TPDOs far too often, a boot-up message while TPDOs go on, or three guard requests
+    /// in a row answered twice.
     DuplicateSuspected {
         /// What was seen.
         evidence: &'static str,
     },
     /// Nothing suspicious for 30 s after `DuplicateSuspected`.
     DuplicateCleared,
-    /// Any frame on one of this node's identifiers, for the frame counter; precedes what the frame caused.
+    /// A data frame of the node on one of its identifiers, for the frame counter; precedes what the frame caused.
     FrameSeen,
 }
 
@@ -137,13 +140,14 @@ pub enum ForeignEvent {
         /// Its node id byte, 0 = all.
         node: u8,
     },
-    /// A frame of an identifier that belongs to no configured node.
+    /// A frame of an identifier that belongs to no configured node, or a malformed NMT command.
     UnknownId {
         /// The identifier.
         id: CanId,
         /// The node id, where the identifier belongs to the predefined connection set.
         node: Option<NodeId>,
-        /// Whether it is the first frame of this identifier.
+        /// Whether it is the first frame of this identifier. Of 29-bit identifiers the first 256 are remembered; those
+        /// beyond are never called first.
         first: bool,
     },
 }

@@ -11,15 +11,23 @@
 //! - [`nmt`]: states and commands.
 //! - [`settings`]: what a network and its nodes are to do.
 //! - [`event`]: what a network tells.
-//! - `guarding`, `heartbeat`, `start`, `pdo`: one machine each, for one node.
-//! - `node`: one node, made of those machines.
+//! - `guarding`, `heartbeat`, `start`, `pdo`, `duplicate`: one machine each, for one node.
+//! - `node`: one node, made of those machines; `reception`: what its frames mean for it.
 //! - `network`: all nodes of a bus; dispatches frames.
 
 pub mod cob_id;
+mod duplicate;
 pub mod event;
+mod guarding;
+mod heartbeat;
 pub mod network;
 pub mod nmt;
+mod node;
+mod outputs;
+mod pdo;
+mod reception;
 pub mod settings;
+mod start;
 
 pub use cob_id::NodeId;
 pub use event::{ForeignEvent, NetworkOutput, NodeEvent};

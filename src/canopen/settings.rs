@@ -11,7 +11,8 @@ pub enum Role {
     /// NMT master: starts and guards its nodes.
     #[default]
     Master,
-    /// Sends nothing at all; derives what it can from what it overhears.
+    /// Sends nothing at all; derives what it can from what it overhears. Whether a node is lost it can tell only where
+    /// somebody else guards it or it sends heartbeats.
     Passive,
 }
 
@@ -22,7 +23,7 @@ pub struct NetworkSettings {
     pub role: Role,
     /// Start all nodes with one broadcast instead of one by one (R-DET-018). Off unless asked for.
     pub start_broadcast: bool,
-    /// The nodes; at most one for each node id.
+    /// The nodes; at most one for each node id (R-DET-004), no COB-ID twice. Of two equal ones the first counts.
     pub nodes: Vec<NodeSettings>,
 }
 
@@ -52,17 +53,17 @@ pub enum ErrorControl {
     Guarding(GuardingSettings),
     /// The node tells its state by itself.
     Heartbeat {
-        /// Lost after this long without a frame on `0x700 + id`.
+        /// Lost after this long without a frame on `0x700 + id`, counted from the start of the gateway.
         timeout: Duration,
     },
-    /// Not at all.
+    /// Not at all. Such a node is started automatically after its boot-up message only: it reports no state.
     None,
 }
 
 /// Node guarding (CiA 301, R-DET-031..046).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GuardingSettings {
-    /// Time between two requests, 20 ms..65.535 s (R-DET-031).
+    /// Time between two requests, 20 ms..65.535 s; zero = no guarding, as [`ErrorControl::None`] (R-DET-031).
     pub guard_time: Duration,
     /// Consecutive missed replies until the node is lost, 1..=255 (R-DET-032).
     pub life_time_factor: u8,
@@ -70,11 +71,12 @@ pub struct GuardingSettings {
     pub reply_timeout: Duration,
     /// What a wrong toggle bit means (R-DET-035).
     pub toggle: TogglePolicy,
-    /// What is expected after a wrong toggle bit.
+    /// Compare a reply's toggle bit with that of the last state frame received, also of one that answered somebody
+    /// else's request, instead of the last reply accepted. Bears with a second master that guards the same node.
     pub toggle_resync: bool,
     /// DLC of the request: 1 for most devices, 0 for some.
     pub rtr_dlc: u8,
-    /// Pause between an NMT command to the node and the next request.
+    /// Pause between an NMT command to the node and the next request: a request that falls into it is sent at its end.
     pub settle: Duration,
 }
 
@@ -104,10 +106,11 @@ pub enum TogglePolicy {
     Off,
 }
 
-/// How a node is started (R-DET-016..020).
+/// How a node is started (R-DET-016..020). Started is a node that reports operational or sends a TPDO.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct StartSettings {
-    /// Send NMT start when it reports pre-operational, or stopped without our order.
+    /// Send NMT start when it reports pre-operational, or stopped, unless an operator put it there through the gateway;
+    /// then it stays so until an operator starts it. Off: the node starts by itself, or an operator starts it.
     pub auto_start: bool,
     /// After a boot-up message start at the latest after this long.
     pub delay: Duration,

@@ -1,0 +1,331 @@
+//! One node: the machines of its life, its start and its TPDOs, and the state it is believed to be in.
+//!
+//! This file joins the machines and runs their clocks; what a received frame means is in `reception`.
+
+use std::time::Duration;
+
+use super::duplicate::Duplicate;
+use super::guarding::{Failure, Guarding};
+use super::heartbeat::Heartbeat;
+use super::outputs::Outputs;
+use super::pdo::Pdos;
+use super::start::Start;
+use super::{ErrorControl, NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, Role, cob_id};
+use crate::can::CanFrame;
+use crate::time::Instant;
+
+/// A boot-up message this long after an ordered reset was ordered too; slow devices take seconds.
+const RESET_TAKES: Duration = Duration::from_secs(30);
+
+/// One node.
+#[derive(Debug)]
+pub(super) struct Node {
+    pub(super) id: NodeId,
+    pub(super) watch: Watch,
+    /// `None` in the passive role.
+    pub(super) start: Option<Start>,
+    pub(super) pdos: Pdos,
+    pub(super) duplicate: Duplicate,
+    /// Started by nobody: its TPDOs may follow its boot-up message at once.
+    pub(super) self_starting: bool,
+    /// The believed state; `None` before the first sign.
+    pub(super) state: Option<NmtState>,
+    /// Where the last NMT command leads, until the node goes elsewhere.
+    pub(super) ordered: Option<NmtState>,
+    /// Until then a boot-up message is the effect of an ordered reset.
+    pub(super) reset_until: Option<Instant>,
+    /// Undefined state code that was told last.
+    pub(super) invalid: Option<u8>,
+    pub(super) unsolicited_told: bool,
+    /// Until then somebody else is known to guard this node.
+    pub(super) foreign_guard_until: Option<Instant>,
+    pub(super) seen: bool,
+    never_seen_after: Duration,
+    never_seen_at: Option<Instant>,
+    never_seen_told: bool,
+}
+
+/// How the life of the node is watched.
+#[derive(Debug)]
+pub(super) enum Watch {
+    /// By asking.
+    Guarding(Guarding),
+    /// By listening.
+    Heartbeat(Heartbeat),
+    /// Not at all.
+    Nothing,
+}
+
+impl Watch {
+    /// `phase`: wait before the first guard request.
+    fn new(control: ErrorControl, role: Role, phase: Duration, now: Instant) -> Self {
+        match (control, role) {
+            (ErrorControl::Guarding(settings), _) if settings.guard_time.is_zero() => Self::Nothing,
+            (ErrorControl::Guarding(settings), Role::Master) => {
+                Self::Guarding(Guarding::new(settings, phase, now))
+            }
+            (ErrorControl::Guarding(settings), Role::Passive) => {
+                let life_time = settings.guard_time.saturating_mul(settings.life_time_factor.max(1).into());
+                Self::Heartbeat(Heartbeat::after_first_frame(life_time + settings.reply_timeout))
+            }
+            (ErrorControl::Heartbeat { timeout }, Role::Master) => {
+                Self::Heartbeat(Heartbeat::new(timeout, now))
+            }
+            (ErrorControl::Heartbeat { timeout }, Role::Passive) => {
+                Self::Heartbeat(Heartbeat::after_first_frame(timeout))
+            }
+            (ErrorControl::None, _) => Self::Nothing,
+        }
+    }
+
+    /// Whether the node is lost.
+    pub(super) fn is_lost(&self) -> bool {
+        match self {
+            Self::Guarding(guarding) => guarding.is_lost(),
+            Self::Heartbeat(heartbeat) => heartbeat.is_lost(),
+            Self::Nothing => false,
+        }
+    }
+
+    /// The guard machine, where there is one.
+    pub(super) fn guarding(&mut self) -> Option<&mut Guarding> {
+        match self {
+            Self::Guarding(guarding) => Some(guarding),
+            Self::Heartbeat(_) | Self::Nothing => None,
+        }
+    }
+}
+
+impl Node {
+    /// A node of which nothing is known; first guarded `phase` after `now`.
+    pub(super) fn new(settings: NodeSettings, role: Role, phase: Duration, now: Instant) -> Self {
+        Self {
+            id: settings.id,
+            watch: Watch::new(settings.error_control, role, phase, now),
+            self_starting: !settings.start.auto_start,
+            start: (role == Role::Master).then(|| Start::new(settings.start)),
+            duplicate: Duplicate::new(&settings.pdos),
+            pdos: Pdos::new(settings.pdos),
+            state: None,
+            ordered: None,
+            reset_until: None,
+            invalid: None,
+            unsolicited_told: false,
+            foreign_guard_until: None,
+            seen: false,
+            never_seen_after: settings.never_seen_after,
+            never_seen_at: Some(now + settings.never_seen_after),
+            never_seen_told: false,
+        }
+    }
+
+    /// Whether nobody would mind if it were started: it may be included in a broadcast.
+    pub(super) fn may_be_started_with_all(&self) -> bool {
+        !self.self_starting && self.start.as_ref().is_some_and(|start| !start.is_held())
+    }
+
+    /// An operator's command, or an automatic one, was sent to this node.
+    pub(super) fn command_sent(
+        &mut self,
+        now: Instant,
+        request: NmtRequest,
+        manual: bool,
+        outputs: &mut Outputs,
+    ) {
+        self.note_sent(now, request, outputs);
+        let Some(start) = &mut self.start else { return };
+        match request {
+            NmtRequest::Start => {
+                if manual {
+                    start.release();
+                }
+                start.sent(now);
+            }
+            NmtRequest::Stop | NmtRequest::EnterPreOperational => start.hold(),
+            NmtRequest::ResetNode | NmtRequest::ResetCommunication => start.cancel(),
+        }
+    }
+
+    /// A start of all nodes was sent because of another node (R-DET-018).
+    pub(super) fn started_with_all(&mut self, now: Instant, outputs: &mut Outputs) {
+        let waiting = matches!(self.state, Some(NmtState::Stopped | NmtState::PreOperational));
+        self.note_sent(now, NmtRequest::Start, outputs);
+        if let Some(start) = self.start.as_mut().filter(|_| waiting && !self.watch.is_lost()) {
+            start.sent(now);
+        }
+    }
+
+    fn note_sent(&mut self, now: Instant, request: NmtRequest, outputs: &mut Outputs) {
+        outputs.node(self.id, NodeEvent::NmtSent { request });
+        if let Some(guarding) = self.watch.guarding() {
+            guarding.settle(now);
+        }
+        self.expect(now, request);
+    }
+
+    /// Resets the node by itself, because the settings say so (R-DET-016).
+    pub(super) fn send_reset(&mut self, now: Instant, outputs: &mut Outputs) {
+        outputs.transmit(NmtRequest::ResetNode.frame(Some(self.id)));
+        self.command_sent(now, NmtRequest::ResetNode, false, outputs);
+    }
+
+    /// A master, ourselves or in the passive role another, sent a command: what the node will do is no surprise.
+    pub(super) fn expect(&mut self, now: Instant, request: NmtRequest) {
+        self.ordered = Some(match request {
+            NmtRequest::Start => NmtState::Operational,
+            NmtRequest::Stop => NmtState::Stopped,
+            NmtRequest::EnterPreOperational | NmtRequest::ResetNode | NmtRequest::ResetCommunication => {
+                NmtState::PreOperational
+            }
+        });
+        match request {
+            NmtRequest::Start => {
+                self.duplicate.handle_start();
+                if !self.watch.is_lost() {
+                    self.pdos.supervise(now);
+                }
+            }
+            NmtRequest::Stop | NmtRequest::EnterPreOperational => self.pdos.stop(),
+            NmtRequest::ResetNode | NmtRequest::ResetCommunication => {
+                self.pdos.stop();
+                self.reset_until = Some(now + RESET_TAKES);
+                if let Some(guarding) = self.watch.guarding() {
+                    guarding.forget_reference();
+                }
+            }
+        }
+    }
+
+    /// A guard request of ours did not leave.
+    pub(super) fn guard_request_not_sent(&mut self) {
+        if let Some(guarding) = self.watch.guarding() {
+            guarding.handle_not_sent();
+        }
+    }
+
+    /// A command of ours to this node did not leave.
+    pub(super) fn command_not_sent(&mut self, request: NmtRequest) {
+        match request {
+            NmtRequest::Start => {
+                if let Some(start) = &mut self.start {
+                    start.handle_not_sent();
+                }
+            }
+            NmtRequest::ResetNode | NmtRequest::ResetCommunication => self.reset_until = None,
+            NmtRequest::Stop | NmtRequest::EnterPreOperational => {}
+        }
+    }
+
+    /// The bus cannot be used: silence proves nothing.
+    pub(super) fn pause(&mut self) {
+        match &mut self.watch {
+            Watch::Guarding(guarding) => guarding.pause(),
+            Watch::Heartbeat(heartbeat) => heartbeat.pause(),
+            Watch::Nothing => {}
+        }
+        if let Some(start) = &mut self.start {
+            start.pause();
+        }
+        self.pdos.stop();
+        self.never_seen_at = None;
+    }
+
+    /// The bus can be used again: as at the start, but what was known stays known.
+    pub(super) fn resume(&mut self, now: Instant) {
+        match &mut self.watch {
+            Watch::Guarding(guarding) => guarding.resume(now),
+            Watch::Heartbeat(heartbeat) => heartbeat.resume(now),
+            Watch::Nothing => {}
+        }
+        if let Some(start) = &mut self.start {
+            start.resume(now);
+        }
+        if self.state == Some(NmtState::Operational) && !self.watch.is_lost() {
+            self.pdos.supervise(now);
+        }
+        if !self.seen && !self.never_seen_told {
+            self.never_seen_at = Some(now + self.never_seen_after);
+        }
+    }
+
+    /// What became due. `true`: a start command is due.
+    pub(super) fn handle_timeout(&mut self, now: Instant, outputs: &mut Outputs) -> bool {
+        match &mut self.watch {
+            Watch::Guarding(guarding) => {
+                let due = guarding.handle_timeout(now);
+                let dlc = guarding.rtr_dlc();
+                if let Some(failure) = due.missed {
+                    self.missed(failure, outputs);
+                }
+                let request = CanFrame::remote_frame(cob_id::error_control(self.id), dlc);
+                if let Some(request) = request.filter(|_| due.request) {
+                    outputs.transmit(request);
+                }
+            }
+            Watch::Heartbeat(heartbeat) => {
+                if heartbeat.handle_timeout(now) {
+                    self.lost(false, outputs);
+                }
+            }
+            Watch::Nothing => {}
+        }
+        while let Some(pdo) = self.pdos.next_late(now) {
+            outputs.node(self.id, NodeEvent::PdoTimeout { pdo });
+        }
+        if self.duplicate.handle_timeout(now) {
+            outputs.node(self.id, NodeEvent::DuplicateCleared);
+        }
+        if self.never_seen_at.is_some_and(|at| at <= now) {
+            self.never_seen_at = None;
+            self.never_seen_told = true;
+            outputs.node(self.id, NodeEvent::NeverSeen);
+        }
+        let start = self.start.as_mut().and_then(|start| start.handle_timeout(now));
+        if let Some(attempts) = start.and_then(|due| due.failed) {
+            outputs.node(self.id, NodeEvent::StartFailed { attempts });
+        }
+        start.is_some()
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) has something to do, and why.
+    pub(super) fn poll_timeout(&self) -> Option<(Instant, &'static str)> {
+        let watch = match &self.watch {
+            Watch::Guarding(guarding) => guarding.poll_timeout(),
+            Watch::Heartbeat(heartbeat) => heartbeat.poll_timeout(),
+            Watch::Nothing => None,
+        };
+        let start = self.start.as_ref().and_then(Start::poll_timeout);
+        let never_seen = self.never_seen_at.map(|at| (at, "node never seen"));
+        [watch, start, self.pdos.poll_timeout(), self.duplicate.poll_timeout(), never_seen]
+            .into_iter()
+            .flatten()
+            .min_by_key(|(at, _)| *at)
+    }
+
+    /// A guard request was not answered.
+    pub(super) fn missed(&mut self, failure: Failure, outputs: &mut Outputs) {
+        outputs.node(self.id, NodeEvent::GuardMissed { consecutive: failure.consecutive });
+        if let Some(stuck_toggle) = failure.lost {
+            self.lost(stuck_toggle, outputs);
+        }
+    }
+
+    /// The node is lost (R-DET-036).
+    pub(super) fn lost(&mut self, stuck_toggle: bool, outputs: &mut Outputs) {
+        outputs.node(self.id, NodeEvent::Lost { stuck_toggle });
+        self.pdos.stop();
+        if let Some(start) = &mut self.start {
+            start.cancel();
+        }
+    }
+
+    /// A frame of this node came: the first ends the wait for it.
+    pub(super) fn frame_seen(&mut self, outputs: &mut Outputs) {
+        outputs.node(self.id, NodeEvent::FrameSeen);
+        if !self.seen {
+            self.seen = true;
+            self.never_seen_at = None;
+            outputs.node(self.id, NodeEvent::Seen);
+        }
+    }
+}

@@ -1,0 +1,311 @@
+//! What a frame of a node means for it: boot-up messages, states, TPDOs, emergencies.
+//!
+//! Functions that may find that the node waits to be started return whether it does.
+
+use std::time::Duration;
+
+use super::guarding::Verdict;
+use super::node::{Node, Watch};
+use super::outputs::Outputs;
+use super::pdo::Length;
+use super::{NmtRequest, NmtState, NodeEvent, PdoIndex};
+use crate::can::{CanFrame, CanId};
+use crate::time::Instant;
+
+/// Another guarding master is forgotten, and told anew, after this long without a request of it.
+const FOREIGN_GUARD_QUIET: Duration = Duration::from_secs(60);
+
+impl Node {
+    /// A frame on `0x700 + id`.
+    pub(super) fn handle_error_control(
+        &mut self,
+        now: Instant,
+        frame: &CanFrame,
+        outputs: &mut Outputs,
+    ) -> bool {
+        if frame.is_remote() {
+            self.guard_request(now, outputs);
+            return false;
+        }
+        self.frame_seen(outputs);
+        if frame.dlc() != 1 {
+            outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
+        }
+        match frame.data().first() {
+            None => false,
+            Some(0) => self.boot_up(now, outputs),
+            Some(&byte) => self.state_frame(now, byte & 0x80 != 0, byte & 0x7F, outputs),
+        }
+    }
+
+    /// A guard request that we did not send (R-DET-043). In the passive role that is another's business.
+    fn guard_request(&mut self, now: Instant, outputs: &mut Outputs) {
+        if self.start.is_none() {
+            return;
+        }
+        if let Some(guarding) = self.watch.guarding() {
+            guarding.handle_foreign_request(now);
+        }
+        let known = self.foreign_guard_until.replace(now + FOREIGN_GUARD_QUIET);
+        if known.is_none_or(|until| until < now) {
+            outputs.node(self.id, NodeEvent::ForeignGuardMaster);
+        }
+    }
+
+    /// A state frame `00`: a boot-up message, or a reply of a node that is still initialising with toggle bit 0; the two
+    /// look the same (R-DET-029, R-DET-034, R-DET-039).
+    fn boot_up(&mut self, now: Instant, outputs: &mut Outputs) -> bool {
+        let initialising = self.state == Some(NmtState::Initialising);
+        let (recovered, reply) = match &mut self.watch {
+            Watch::Guarding(guarding) => guarding.handle_zero(),
+            Watch::Heartbeat(heartbeat) => (heartbeat.handle_boot_up(now), false),
+            Watch::Nothing => (false, false),
+        };
+        if recovered {
+            outputs.node(self.id, NodeEvent::Recovered);
+        }
+        if initialising && reply {
+            return false;
+        }
+        if let Some(guarding) = self.watch.guarding() {
+            guarding.ask_after_boot_up(now);
+        }
+        self.duplicate.handle_boot_up(now, self.self_starting);
+        let expected = self.reset_until.take().is_some_and(|until| now <= until);
+        let was_running = self.state.is_some() && !initialising;
+        if was_running && !expected {
+            outputs.node(self.id, NodeEvent::Restarted);
+        }
+        self.invalid = None;
+        self.set_state(NmtState::Initialising, true, outputs);
+        self.ordered = None;
+        self.pdos.stop();
+        if let Some(start) = &mut self.start {
+            start.handle_boot_up(now);
+        }
+        false
+    }
+
+    /// A state frame other than `00`.
+    fn state_frame(&mut self, now: Instant, toggle: bool, code: u8, outputs: &mut Outputs) -> bool {
+        let recovered = match &mut self.watch {
+            Watch::Guarding(guarding) => {
+                let missed = guarding.expire(now);
+                let verdict = guarding.handle_reply(now, toggle);
+                if let Some(failure) = missed {
+                    self.missed(failure, outputs);
+                }
+                match self.weigh(now, verdict, outputs) {
+                    Some(recovered) => recovered,
+                    None => return false,
+                }
+            }
+            Watch::Heartbeat(heartbeat) => heartbeat.alive(now),
+            Watch::Nothing => false,
+        };
+        if recovered {
+            outputs.node(self.id, NodeEvent::Recovered);
+        }
+        let start = self.report(now, code, outputs);
+        let reset = recovered && self.start.as_ref().is_some_and(super::start::Start::resets_on_recovery);
+        if reset {
+            self.send_reset(now, outputs);
+        }
+        start && !reset
+    }
+
+    /// Tells what a guard reply was; `None` where its state does not count, else whether it ended the loss.
+    fn weigh(&mut self, now: Instant, verdict: Verdict, outputs: &mut Outputs) -> Option<bool> {
+        match verdict {
+            Verdict::Valid { recovered, wrong_toggle } => {
+                self.duplicate.handle_reply();
+                if let Some(consecutive) = wrong_toggle {
+                    outputs.node(self.id, NodeEvent::ToggleError { consecutive });
+                }
+                Some(recovered)
+            }
+            Verdict::ToggleError(failure) => {
+                self.duplicate.handle_reply();
+                outputs.node(self.id, NodeEvent::ToggleError { consecutive: failure.consecutive });
+                if let Some(stuck_toggle) = failure.lost {
+                    self.lost(stuck_toggle, outputs);
+                }
+                None
+            }
+            Verdict::Unsolicited { foreign, twice } => {
+                if twice && let Some(evidence) = self.duplicate.handle_second_reply(now) {
+                    outputs.node(self.id, NodeEvent::DuplicateSuspected { evidence });
+                }
+                if !foreign && !std::mem::replace(&mut self.unsolicited_told, true) {
+                    outputs.node(self.id, NodeEvent::UnsolicitedState);
+                }
+                Some(false)
+            }
+        }
+    }
+
+    /// The node reports a state code.
+    fn report(&mut self, now: Instant, code: u8, outputs: &mut Outputs) -> bool {
+        let Some(state) = NmtState::from_code(code) else {
+            if self.invalid.replace(code) != Some(code) {
+                outputs.node(self.id, NodeEvent::InvalidState { raw: code });
+            }
+            return false;
+        };
+        self.invalid = None;
+        self.set_state(state, self.is_ordered(state), outputs);
+        match state {
+            NmtState::Operational => {
+                self.operational(now, outputs);
+                false
+            }
+            NmtState::Initialising => {
+                self.pdos.stop();
+                false
+            }
+            NmtState::Stopped | NmtState::PreOperational => {
+                self.pdos.stop();
+                let lost = self.watch.is_lost();
+                self.start.as_ref().is_some_and(|start| !lost && start.handle_idle_node())
+            }
+        }
+    }
+
+    /// Whether a change to this state is what a command or the end of initialisation leads to (R-DET-038).
+    fn is_ordered(&self, to: NmtState) -> bool {
+        match self.state {
+            None => true,
+            Some(NmtState::Initialising) if to == NmtState::PreOperational || self.self_starting => true,
+            Some(_) => self.ordered == Some(to),
+        }
+    }
+
+    fn set_state(&mut self, to: NmtState, ordered: bool, outputs: &mut Outputs) {
+        let from = self.state.replace(to);
+        if from != Some(to) {
+            if !ordered {
+                self.ordered = None;
+            }
+            outputs.node(self.id, NodeEvent::State { from, to, ordered });
+        }
+    }
+
+    fn operational(&mut self, now: Instant, outputs: &mut Outputs) {
+        if self.start.as_mut().is_some_and(super::start::Start::handle_operational) {
+            outputs.node(self.id, NodeEvent::StartSucceeded);
+        }
+        if !self.watch.is_lost() {
+            self.pdos.supervise(now);
+        }
+    }
+
+    /// A frame on the identifier of a TPDO.
+    pub(super) fn handle_pdo(
+        &mut self,
+        now: Instant,
+        pdo: PdoIndex,
+        frame: &CanFrame,
+        outputs: &mut Outputs,
+    ) {
+        if frame.is_remote() {
+            outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
+            return;
+        }
+        self.frame_seen(outputs);
+        let received = frame.dlc();
+        let length = self.pdos.receive(now, pdo, received);
+        let discarded = matches!(length, None | Some(Length::Discarded));
+        if length != Some(Length::Right) {
+            outputs.node(self.id, NodeEvent::PdoLength { pdo, received, discarded });
+        }
+        if discarded {
+            return;
+        }
+        if let Some(evidence) = self.duplicate.handle_pdo(now, pdo) {
+            outputs.node(self.id, NodeEvent::DuplicateSuspected { evidence });
+        }
+        self.believe_operational(now, pdo, outputs);
+        let mut data = [0; 8];
+        for (to, from) in data.iter_mut().zip(frame.data()) {
+            *to = *from;
+        }
+        outputs.node(self.id, NodeEvent::Pdo { pdo, data, length: received });
+    }
+
+    /// Only an operational node sends TPDOs, so it is believed to be one until it reports its state (R-DET-083).
+    fn believe_operational(&mut self, now: Instant, pdo: PdoIndex, outputs: &mut Outputs) {
+        let state = self.state;
+        let ordered = state.is_none() || self.ordered == Some(NmtState::Operational);
+        let surprising = state != Some(NmtState::Operational) && !ordered;
+        if surprising {
+            outputs.node(self.id, NodeEvent::PdoInUnexpectedState { pdo, state });
+        }
+        if self.watch.is_lost() {
+            return;
+        }
+        if state != Some(NmtState::Operational) {
+            self.set_state(NmtState::Operational, ordered, outputs);
+            self.operational(now, outputs);
+        } else if let Some(start) = &mut self.start
+            && start.handle_operational()
+        {
+            outputs.node(self.id, NodeEvent::StartSucceeded);
+        }
+        if surprising && let Some(guarding) = self.watch.guarding() {
+            guarding.probe(now);
+        }
+    }
+
+    /// A frame on `0x080 + id` (R-DET-091). Devices from before version 4 of CiA 301 boot up with an empty one.
+    pub(super) fn handle_emergency(&mut self, now: Instant, frame: &CanFrame, outputs: &mut Outputs) -> bool {
+        if frame.is_remote() {
+            outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
+            return false;
+        }
+        self.frame_seen(outputs);
+        match *frame.data() {
+            [] => return self.boot_up(now, outputs),
+            [low, high, register, ref rest @ ..] => {
+                let mut vendor = [0; 5];
+                for (to, from) in vendor.iter_mut().zip(rest) {
+                    *to = *from;
+                }
+                let code = u16::from_le_bytes([low, high]);
+                outputs.node(self.id, NodeEvent::Emergency { code, register, vendor });
+            }
+            _ => outputs.node(self.id, NodeEvent::Malformed { frame: *frame }),
+        }
+        false
+    }
+
+    /// A 29-bit frame with the number of one of the node's identifiers (R-DET-006).
+    pub(super) fn handle_foreign_format(&mut self, frame: &CanFrame, outputs: &mut Outputs) {
+        debug_assert!(matches!(frame.id(), CanId::Extended(_)), "11-bit frames are dispatched by kind");
+        outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
+    }
+
+    /// Another master's command to this node was overheard. Its effect is believed in the passive role, which has no
+    /// other way to learn of it; a master asks the node instead.
+    pub(super) fn handle_foreign_command(
+        &mut self,
+        now: Instant,
+        request: NmtRequest,
+        outputs: &mut Outputs,
+    ) {
+        if self.start.is_some() {
+            if request == NmtRequest::Start {
+                self.duplicate.handle_start();
+            }
+            return;
+        }
+        self.expect(now, request);
+        let reached = match request {
+            NmtRequest::Stop => Some(NmtState::Stopped),
+            NmtRequest::EnterPreOperational => Some(NmtState::PreOperational),
+            NmtRequest::Start | NmtRequest::ResetNode | NmtRequest::ResetCommunication => None,
+        };
+        if let Some(state) = reached.filter(|_| self.seen) {
+            self.set_state(state, true, outputs);
+        }
+    }
+}

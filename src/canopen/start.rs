@@ -1,0 +1,222 @@
+//! Starting one node and seeing to it that it did start (R-DET-016..020).
+
+use super::StartSettings;
+use crate::time::Instant;
+
+/// Unanswered start commands after which the start has failed (R-DET-020).
+const ATTEMPTS: u32 = 3;
+
+/// The start machine of one node.
+#[derive(Debug)]
+pub(super) struct Start {
+    settings: StartSettings,
+    phase: Phase,
+    /// Start commands of this attempt to start.
+    attempts: u32,
+    /// `StartFailed` was told and the node has not been operational since.
+    failed: bool,
+    /// An operator took the node out of operation: it stays so until an operator starts it.
+    held: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    /// Nothing to do.
+    Idle,
+    /// After a boot-up message: start then, if the node has not reported pre-operational by then (R-DET-019).
+    Booting(Instant),
+    /// A command was sent; repeat it then.
+    Sent(Instant),
+    /// The bus went down while a start was under way.
+    Paused,
+}
+
+/// A start command is due.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct StartDue {
+    /// The start has failed, after so many commands; told once.
+    pub(super) failed: Option<u32>,
+}
+
+impl Start {
+    /// Nothing under way.
+    pub(super) fn new(settings: StartSettings) -> Self {
+        Self { settings, phase: Phase::Idle, attempts: 0, failed: false, held: false }
+    }
+
+    /// Whether an operator took the node out of operation.
+    pub(super) fn is_held(&self) -> bool {
+        self.held
+    }
+
+    /// Whether a lost node is to be reset when it comes back.
+    pub(super) fn resets_on_recovery(&self) -> bool {
+        self.settings.reset_on_recovery
+    }
+
+    /// A boot-up message: what was under way is void.
+    pub(super) fn handle_boot_up(&mut self, now: Instant) {
+        self.cancel();
+        if self.settings.auto_start && !self.held {
+            self.phase = Phase::Booting(now + self.settings.delay);
+        }
+    }
+
+    /// The node reports pre-operational or stopped. `true`: a start command is due now (R-DET-017).
+    pub(super) fn handle_idle_node(&self) -> bool {
+        self.settings.auto_start && !self.held && !matches!(self.phase, Phase::Sent(_))
+    }
+
+    /// The node is operational, or sends TPDOs. `true`: after a failed start.
+    pub(super) fn handle_operational(&mut self) -> bool {
+        self.cancel();
+        std::mem::take(&mut self.failed)
+    }
+
+    /// A start command was sent.
+    pub(super) fn sent(&mut self, now: Instant) {
+        self.attempts = self.attempts.saturating_add(1);
+        let wait = if self.attempts == 1 { self.settings.confirm } else { self.settings.retry };
+        self.phase = Phase::Sent(now + wait);
+    }
+
+    /// A start command did not leave: it does not count.
+    pub(super) fn handle_not_sent(&mut self) {
+        self.attempts = self.attempts.saturating_sub(1);
+    }
+
+    /// Nothing is under way any more: the node is lost, reset or ordered elsewhere.
+    pub(super) fn cancel(&mut self) {
+        self.phase = Phase::Idle;
+        self.attempts = 0;
+    }
+
+    /// An operator takes the node out of operation.
+    pub(super) fn hold(&mut self) {
+        self.cancel();
+        self.held = true;
+    }
+
+    /// An operator starts the node.
+    pub(super) fn release(&mut self) {
+        self.cancel();
+        self.held = false;
+    }
+
+    /// The bus cannot be used.
+    pub(super) fn pause(&mut self) {
+        if self.phase != Phase::Idle {
+            self.phase = Phase::Paused;
+            self.attempts = 0;
+        }
+    }
+
+    /// The bus can be used again: a start that was under way goes on as after a boot-up message.
+    pub(super) fn resume(&mut self, now: Instant) {
+        if self.phase == Phase::Paused {
+            self.phase = Phase::Booting(now + self.settings.delay);
+        }
+    }
+
+    /// Whether a start command is due; [`sent`](Self::sent) is to follow.
+    pub(super) fn handle_timeout(&mut self, now: Instant) -> Option<StartDue> {
+        match self.phase {
+            Phase::Booting(at) if at <= now => Some(StartDue { failed: None }),
+            Phase::Sent(at) if at <= now => {
+                let failed = self.attempts >= ATTEMPTS && !self.failed;
+                self.failed |= failed;
+                Some(StartDue { failed: failed.then_some(self.attempts) })
+            }
+            Phase::Idle | Phase::Booting(_) | Phase::Sent(_) | Phase::Paused => None,
+        }
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) has something to do.
+    pub(super) fn poll_timeout(&self) -> Option<(Instant, &'static str)> {
+        match self.phase {
+            Phase::Booting(at) => Some((at, "start after boot-up")),
+            Phase::Sent(at) => Some((at, "start confirmation")),
+            Phase::Idle | Phase::Paused => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(millis: u64) -> Instant {
+        Instant::from_millis(millis)
+    }
+
+    fn due(start: &mut Start, millis: u64) -> Option<StartDue> {
+        start.handle_timeout(at(millis))
+    }
+
+    const DUE: Option<StartDue> = Some(StartDue { failed: None });
+
+    #[test]
+    fn r_det_020_start_is_repeated_and_fails_after_three_unanswered_commands() {
+        let mut start = Start::new(StartSettings::default());
+        assert!(start.handle_idle_node());
+        start.sent(at(0));
+        assert!(!start.handle_idle_node(), "one command at a time");
+        assert_eq!(due(&mut start, 999), None);
+        for (millis, failed) in [(1000, None), (2000, None), (3000, Some(3)), (4000, None), (5000, None)] {
+            assert_eq!(due(&mut start, millis), Some(StartDue { failed }), "at {millis}");
+            start.sent(at(millis));
+        }
+        assert!(start.handle_operational());
+        assert!(!start.handle_operational(), "told once");
+        assert_eq!(start.poll_timeout(), None);
+    }
+
+    #[test]
+    fn r_det_019_start_after_boot_up_waits_for_the_delay_at_most() {
+        let mut start = Start::new(StartSettings::default());
+        start.handle_boot_up(at(100));
+        assert_eq!(start.poll_timeout(), Some((at(600), "start after boot-up")));
+        assert!(start.handle_idle_node(), "a report of pre-operational starts at once");
+        assert_eq!(due(&mut start, 599), None);
+        assert_eq!(due(&mut start, 600), DUE);
+    }
+
+    #[test]
+    fn r_det_017_a_node_that_an_operator_stopped_stays_stopped() {
+        let mut start = Start::new(StartSettings::default());
+        start.hold();
+        assert!(!start.handle_idle_node());
+        start.handle_boot_up(at(0));
+        assert_eq!(start.poll_timeout(), None);
+        start.release();
+        assert!(start.handle_idle_node());
+    }
+
+    #[test]
+    fn r_det_017_without_auto_start_nothing_is_started() {
+        let mut start = Start::new(StartSettings { auto_start: false, ..StartSettings::default() });
+        start.handle_boot_up(at(0));
+        assert!(!start.handle_idle_node());
+        assert_eq!(start.poll_timeout(), None);
+    }
+
+    #[test]
+    fn a_command_that_did_not_leave_is_no_attempt() {
+        let mut start = Start::new(StartSettings::default());
+        for millis in [0, 1000, 2000, 3000, 4000] {
+            start.sent(at(millis));
+            start.handle_not_sent();
+            assert_eq!(due(&mut start, millis + 1000), DUE);
+        }
+    }
+
+    #[test]
+    fn a_start_that_the_bus_interrupted_goes_on() {
+        let mut start = Start::new(StartSettings::default());
+        start.sent(at(0));
+        start.pause();
+        assert_eq!(due(&mut start, 9000), None);
+        start.resume(at(9000));
+        assert_eq!(due(&mut start, 9500), DUE);
+    }
+}
