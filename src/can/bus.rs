@@ -1,6 +1,7 @@
 //! Opens any kind of interface. \[IO\]
 
 use super::interface::Interface;
+use super::socketcan::{self, SocketReader, SocketWriter};
 use super::virtual_bus::{self, VirtualReader, VirtualWriter};
 use super::{BusError, BusEvent, BusReader, BusWriter, CanBus, CanFrame, Tally};
 use crate::time::Clock;
@@ -15,6 +16,8 @@ pub struct AnyBus {
 /// The receiving half of [`AnyBus`].
 #[derive(Debug)]
 pub enum AnyReader {
+    /// An interface of the host.
+    SocketCan(SocketReader),
     /// A bus inside the process.
     Virtual(VirtualReader),
 }
@@ -22,6 +25,8 @@ pub enum AnyReader {
 /// The sending half of [`AnyBus`].
 #[derive(Debug)]
 pub enum AnyWriter {
+    /// An interface of the host.
+    SocketCan(SocketWriter),
     /// A bus inside the process.
     Virtual(VirtualWriter),
 }
@@ -34,11 +39,15 @@ pub enum AnyWriter {
 /// The interface is not there, or the system refuses it.
 pub fn open(interface: &Interface, clock: Clock) -> Result<AnyBus, BusError> {
     match interface {
+        Interface::SocketCan(name) => {
+            let (reader, writer) = socketcan::open(name, clock)?;
+            Ok(AnyBus { reader: AnyReader::SocketCan(reader), writer: AnyWriter::SocketCan(writer) })
+        }
         Interface::Virtual(name) => {
             let (reader, writer) = virtual_bus::join(name, clock).split();
             Ok(AnyBus { reader: AnyReader::Virtual(reader), writer: AnyWriter::Virtual(writer) })
         }
-        Interface::SocketCan(_) | Interface::Slcan { .. } | Interface::SlcanTcp { .. } => Err(BusError::Io {
+        Interface::Slcan { .. } | Interface::SlcanTcp { .. } => Err(BusError::Io {
             interface: interface.to_string(),
             source: std::io::Error::from(std::io::ErrorKind::Unsupported),
         }),
@@ -75,12 +84,14 @@ impl CanBus for AnyBus {
 impl BusReader for AnyReader {
     async fn recv(&mut self) -> Result<BusEvent, BusError> {
         match self {
+            Self::SocketCan(reader) => reader.recv().await,
             Self::Virtual(reader) => reader.recv().await,
         }
     }
 
     fn tally(&self) -> Tally {
         match self {
+            Self::SocketCan(reader) => reader.tally(),
             Self::Virtual(reader) => reader.tally(),
         }
     }
@@ -89,6 +100,7 @@ impl BusReader for AnyReader {
 impl BusWriter for AnyWriter {
     async fn send(&mut self, frame: &CanFrame) -> Result<(), BusError> {
         match self {
+            Self::SocketCan(writer) => writer.send(frame).await,
             Self::Virtual(writer) => writer.send(frame).await,
         }
     }

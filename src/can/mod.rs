@@ -6,11 +6,18 @@
 //! - this file: [`BusEvent`] and the [`CanBus`] trait, the seam between a bus and the gateway.
 //! - [`interface`]: how an interface is written (`can0`, `virtual:demo`, `slcan:/dev/ttyACM0`).
 //! - [`bus`] \[IO\]: [`open`] any interface.
+//! - [`socketcan`] \[IO\]: interfaces of the host, with [`host_link`] \[IO\] (what the host says of them) and, pure,
+//!   [`raw_frame`] (what a socket gives), [`controller`] (the state of the link), [`stamp`] (receive times).
 //! - [`virtual_bus`] \[IO\]: buses inside the process.
 
 pub mod bus;
+pub mod controller;
 pub mod frame;
+pub mod host_link;
 pub mod interface;
+pub mod raw_frame;
+pub mod socketcan;
+pub mod stamp;
 pub mod virtual_bus;
 
 use std::future::Future;
