@@ -1,11 +1,43 @@
 //! Modbus TCP: the process image as registers and bits (MODBUS Application Protocol V1.1b3).
 //!
+//! What stands where, pure:
 //! - [`settings`]: the `[modbus]` table of the configuration.
-//! - `register_map`: which address shows what; built once from the tag table, immutable.
-//! - `register_bank`: reads registers out of the process image.
-//! - `pdu`: requests and replies, pure; every length is checked before it is used.
-//! - `server` \[IO\]: connections.
+//! - [`node_block`], [`gateway_block`], [`event_ring`]: the fixed blocks, each with what its registers mean.
+//! - [`register_map`]: which unit and address shows what; built once from the tag table, immutable.
+//!   [`address_space`] is the part that is the same for registers and bits, [`points`] the list for people.
+//! - [`register_bank`]: reads registers out of the process image. [`encoding`]: values as registers.
+//!
+//! How it is asked for, pure:
+//! - [`frame`]: the MBAP header. [`pdu`]: requests; every length is checked before it is used.
+//! - [`identification`]: FC 43/14. [`service`]: from a request to its answer.
+//!
+//! On the network:
+//! - [`server`] \[IO\]: listens, accepts, limits. [`connection`] \[IO\]: one client.
+//! - [`slots`]: who must go when all connections are in use. [`counters`]: what happened.
 
+pub mod address_space;
+pub mod connection;
+pub mod counters;
+pub mod encoding;
+pub mod event_ring;
+pub mod frame;
+pub mod gateway_block;
+pub mod heartbeat;
+pub mod identification;
+pub mod node_block;
+pub mod pdu;
+pub mod points;
+pub mod register_bank;
+pub mod register_map;
+pub mod server;
+pub mod service;
 pub mod settings;
+pub mod slots;
+mod source;
 
+pub use counters::{CounterValues, Counters, End};
+pub use points::{MapDocument, Point, Table};
+pub use register_bank::RegisterBank;
+pub use register_map::{MapError, RegisterMap};
+pub use server::{BindError, Server};
 pub use settings::{ModbusSettings, SettingsError, WordOrder};

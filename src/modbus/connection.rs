@@ -1,0 +1,174 @@
+//! One client: reads requests, answers them in order, knows when to give up. \[IO\]
+
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio_util::sync::CancellationToken;
+
+use super::counters::{Counters, End};
+use super::frame::{self, LONGEST_FRAME, Parsed};
+use super::register_bank::RegisterBank;
+use super::service;
+use super::slots::Activity;
+use crate::process_image::ImageReader;
+use crate::time::Clock;
+
+/// What all connections share.
+#[derive(Debug)]
+pub struct Shared {
+    /// Registers.
+    pub bank: RegisterBank,
+    /// Values.
+    pub reader: ImageReader,
+    /// Time.
+    pub clock: Clock,
+    /// Counters.
+    pub counters: std::sync::Arc<Counters>,
+    /// How long a connection may be silent.
+    pub idle_timeout: Option<Duration>,
+    /// How long a request may stay incomplete.
+    pub partial_frame_timeout: Duration,
+    /// How long an answer may wait.
+    pub send_timeout: Duration,
+}
+
+/// Bytes that are read ahead: several requests that a client sent without waiting.
+const INPUT: usize = 4_096;
+/// Answers of this many bytes are sent before the next request is looked at, so that a client that does not read them
+/// cannot make the server hoard them.
+const OUTPUT: usize = 16_384;
+
+/// Serves a client until it, the network, a time-out or `end` ends it. `end` is why the server may end it.
+pub async fn serve<S>(stream: S, shared: &Shared, activity: &Activity, stops: &Stops) -> End
+where
+    S: AsyncReadExt + AsyncWriteExt + Unpin,
+{
+    let input = vec![0; INPUT];
+    let output = Vec::with_capacity(OUTPUT + LONGEST_FRAME);
+    let mut connection = Connection { stream, shared, activity, input, filled: 0, output };
+    tokio::select! {
+        end = connection.run() => end,
+        () = stops.evict.cancelled() => End::Evicted,
+        () = stops.stop.cancelled() => End::Stopped,
+    }
+}
+
+/// What ends a connection from outside.
+#[derive(Clone, Debug)]
+pub struct Stops {
+    /// It has to make room.
+    pub evict: CancellationToken,
+    /// The gateway stops.
+    pub stop: CancellationToken,
+}
+
+struct Connection<'a, S> {
+    stream: S,
+    shared: &'a Shared,
+    activity: &'a Activity,
+    /// Of fixed length; `filled` bytes of it are not answered yet.
+    input: Vec<u8>,
+    filled: usize,
+    output: Vec<u8>,
+}
+
+/// How far the requests in the input were answered.
+enum Progress {
+    /// All that are complete. `any`: there was at least one.
+    Done { any: bool },
+    /// There may be more, but the answers must leave first.
+    Full,
+    /// What came is no Modbus.
+    Malformed,
+}
+
+impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
+    async fn run(&mut self) -> End {
+        let mut partial_until = None;
+        loop {
+            loop {
+                let progress = self.answer();
+                if let Err(end) = self.flush().await {
+                    return end;
+                }
+                match progress {
+                    Progress::Full => partial_until = None,
+                    Progress::Malformed => return End::Malformed,
+                    Progress::Done { any } => {
+                        if any || self.filled == 0 {
+                            partial_until = None;
+                        }
+                        break;
+                    }
+                }
+            }
+            let now = self.shared.clock.now().instant;
+            let (until, end) = if self.filled > 0 {
+                let until = *partial_until.get_or_insert(now + self.shared.partial_frame_timeout);
+                (Some(until), End::PartialFrame)
+            } else {
+                (self.shared.idle_timeout.map(|timeout| now + timeout), End::Idle)
+            };
+            let room = self.input.get_mut(self.filled..).unwrap_or_default();
+            let read = self.stream.read(room);
+            let read = match until {
+                None => read.await,
+                Some(until) => match tokio::time::timeout_at(self.shared.clock.deadline(until), read).await {
+                    Ok(read) => read,
+                    Err(_elapsed) => return end,
+                },
+            };
+            match read {
+                Ok(0) => return End::Closed,
+                Ok(count) => self.filled += count,
+                Err(_) => return End::Broken,
+            }
+        }
+    }
+
+    /// Answers the complete requests of the input into the output, and moves what is left to the beginning.
+    fn answer(&mut self) -> Progress {
+        let mut used = 0;
+        let mut any = false;
+        let progress = loop {
+            if self.output.len() >= OUTPUT {
+                break Progress::Full;
+            }
+            match frame::parse(self.input.get(used..self.filled).unwrap_or_default()) {
+                Parsed::Incomplete => break Progress::Done { any },
+                Parsed::Malformed => break Progress::Malformed,
+                Parsed::Foreign { length } => {
+                    self.shared.counters.foreign_frame();
+                    used += length;
+                }
+                Parsed::Frame(request) => {
+                    used += request.length();
+                    let Shared { bank, reader, clock, counters, .. } = self.shared;
+                    let now = clock.now();
+                    let output = &mut self.output;
+                    let exception = reader.read(|image| service::answer(bank, image, now, &request, output));
+                    counters.request(exception);
+                    self.activity.touch(now.instant);
+                }
+            }
+            any = true;
+        };
+        self.input.copy_within(used..self.filled, 0);
+        self.filled -= used;
+        progress
+    }
+
+    /// Sends all answers at once.
+    async fn flush(&mut self) -> Result<(), End> {
+        if self.output.is_empty() {
+            return Ok(());
+        }
+        let sent = tokio::time::timeout(self.shared.send_timeout, self.stream.write_all(&self.output)).await;
+        self.output.clear();
+        match sent {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(_)) => Err(End::Broken),
+            Err(_elapsed) => Err(End::SlowClient),
+        }
+    }
+}
