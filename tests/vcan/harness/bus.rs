@@ -1,0 +1,96 @@
+//! The CAN bus from outside: can-utils, link state, who may use it.
+
+use std::process::Command;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use super::process::{Process, run};
+use super::wait::{wait_for, wait_until};
+
+/// The interface of all tests.
+pub const BUS: &str = "vcan0";
+
+/// vcan0 and the one processor of a guest are there once: one test at a time.
+static IN_USE: Mutex<()> = Mutex::new(());
+
+/// Waits until no other test runs, and leaves the bus as a new one.
+pub fn take_the_bus() -> MutexGuard<'static, ()> {
+    let guard = IN_USE.lock().unwrap_or_else(PoisonError::into_inner);
+    let _ = run("ip", &["link", "del", BUS]);
+    create_interface();
+    guard
+}
+
+/// Makes vcan0 and takes it up.
+pub fn create_interface() {
+    ip(&["link", "add", BUS, "type", "vcan"]);
+    ip(&["link", "set", BUS, "up"]);
+}
+
+/// Runs `ip`, which must work.
+pub fn ip(arguments: &[&str]) {
+    let (good, _, stderr) = run("ip", arguments);
+    assert!(good, "ip {arguments:?}: {stderr}");
+}
+
+/// Sends a frame in candump's notation with can-utils' cansend.
+pub fn cansend(frame: &str) {
+    let (good, _, stderr) = run("cansend", &[BUS, frame]);
+    assert!(good, "cansend {BUS} {frame}: {stderr}");
+}
+
+/// Everything that is on the bus, as can-utils' candump sees it.
+pub struct Capture {
+    candump: Process,
+}
+
+impl Capture {
+    /// Starts candump and waits until it listens.
+    pub fn start() -> Self {
+        // -L: log format; -e is left out: error frames are no frames of a participant.
+        let candump = Process::start("candump", Command::new("candump").args(["-L", BUS]));
+        // A frame that no participant of any test knows, sent until it is seen.
+        let capture = Self { candump };
+        wait_until("candump to listen", || {
+            cansend("7EF#");
+            capture.candump.stdout_count() > 0
+        });
+        capture
+    }
+
+    /// The frames so far with the kernel's time in seconds since 1970, without the frames of [`start`](Self::start).
+    pub fn timed(&self) -> Vec<(f64, String)> {
+        let read = |text: &str| {
+            let mut words = text.split(' ');
+            let time = words.next()?.trim_matches(['(', ')']).parse().ok()?;
+            Some((time, words.nth(1)?.to_owned()))
+        };
+        self.candump
+            .stdout(0)
+            .iter()
+            .filter_map(|line| read(&line.text))
+            .filter(|(_, frame)| frame != "7EF#")
+            .collect()
+    }
+
+    /// The frames so far, for example `701#R1`.
+    pub fn frames(&self) -> Vec<String> {
+        self.timed().into_iter().map(|(_, frame)| frame).collect()
+    }
+
+    /// How many frames there are so far.
+    pub fn count(&self) -> usize {
+        self.frames().len()
+    }
+
+    /// Waits until a frame came after the first `after` frames; gives its place.
+    pub fn wait_for(&self, frame: &str, after: usize) -> usize {
+        wait_for(format!("{frame} on {BUS}"), || {
+            self.frames().iter().skip(after).position(|seen| seen == frame).map(|place| place + after)
+        })
+    }
+
+    /// Waits until these frames came in this order after the first `after` frames, whatever else is between them.
+    pub fn wait_for_sequence(&self, frames: &[&str], after: usize) {
+        frames.iter().fold(after, |next, frame| self.wait_for(frame, next) + 1);
+    }
+}

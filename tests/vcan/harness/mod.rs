@@ -1,0 +1,11 @@
+//! What the tests stand on: processes, bus, broker, clients, a played device.
+
+pub mod broker;
+pub mod bus;
+pub mod device;
+pub mod flood;
+pub mod gateway;
+pub mod modbus;
+pub mod process;
+pub mod proxy;
+pub mod wait;

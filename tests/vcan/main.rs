@@ -1,0 +1,47 @@
+//! The program as its own process on a real CAN interface, with foreign programs around it. Run by `tests/all vcan`.
+//!
+//! | file | what is proved |
+//! |---|---|
+//! | `harness` | (processes, bus, broker, clients, a played device) |
+//! | `harness_itself` | the harness measures what it says: without this no other result counts |
+//! | `start` | cold start before and after the device, power cycle, probe at start-up |
+//! | `examples` | the worked examples V-DET-01..19, sent by cansend, read over Modbus and MQTT |
+//! | `guarding` | lost and found again, toggle bit, restart in the middle of operation |
+//! | `pulse` | a 100 ms trip that a slow client sees |
+//! | `silence` | which frames the gateway ever sends, also when it is stopped or killed; the passive role |
+//! | `faults` | interface down, deleted, bus-off; a full bus |
+//! | `broker` | a broker that is killed again and again |
+//! | `many` | two devices, two clients, a second master |
+//!
+//! vcan0 is there once, so the tests run one after another; each begins with a new interface.
+
+#![allow(
+    clippy::allow_attributes,
+    clippy::as_conversions,
+    clippy::cast_possible_truncation,
+    clippy::disallowed_methods,
+    clippy::doc_markdown,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    clippy::panic,
+    clippy::print_stderr,
+    clippy::print_stdout,
+    clippy::redundant_closure_for_method_calls,
+    clippy::too_many_lines,
+    clippy::unwrap_used,
+    clippy::wildcard_enum_match_arm,
+    dead_code,
+    missing_docs,
+    reason = "a test may fail loudly; helpers are not used by every test"
+)]
+
+mod broker;
+mod examples;
+mod faults;
+mod guarding;
+mod harness;
+mod harness_itself;
+mod many;
+mod pulse;
+mod silence;
+mod start;

@@ -1,0 +1,101 @@
+//! Two devices, two kinds of client, a second master.
+
+use std::collections::BTreeSet;
+
+use crate::harness::broker::{Broker, Subscriber};
+use crate::harness::bus::{Capture, cansend, take_the_bus};
+use crate::harness::gateway::{Setup, TOPICS, simulator};
+use crate::harness::modbus::{Table, mbpoll, pymodbus, pymodbus_identification};
+use crate::harness::wait::wait_until;
+
+#[test]
+fn r_det_043_two_detcons_and_a_second_master() {
+    let _bus = take_the_bus();
+    let broker = Broker::start();
+    let subscriber = Subscriber::start(&broker, TOPICS);
+    let capture = Capture::start();
+    let _first = simulator(1, &[]);
+    let _second = simulator(2, &["--seed", "7"]);
+    let gateway = Setup::detcons(&[1, 2]).broker(&broker).start();
+    for node in [1, 2] {
+        gateway
+            .node(node)
+            .wait_for_status("both devices", |status| status.operational() && status.all_good());
+        subscriber.wait_for(&format!("engine{node}/state"), 0, |payload| payload["quality"] == "good");
+    }
+    let online = gateway.unit().input(4, 1)[0];
+    assert!(online == 0b110 || online == 0b11, "bitmap of online nodes: {online:#b}");
+
+    // Another master guards node 1 and stops node 2.
+    let (messages, frames) = (subscriber.count(), capture.count());
+    cansend("701#R1");
+    subscriber.wait_for("engine1/alarm/foreign_guard_master", messages, |payload| payload["active"] == true);
+    cansend("000#0202");
+    subscriber.wait_for("bridge/alarm/can0_foreign_master", messages, |payload| payload["active"] == true);
+    // The gateway undoes the stop, and starts nobody else.
+    capture.wait_for("000#0102", frames);
+    gateway.node(2).wait_for_status("node 2 again", |status| status.operational() && status.all_good());
+    let commands: BTreeSet<_> =
+        capture.frames().into_iter().skip(frames).filter(|frame| frame.starts_with("000#")).collect();
+    assert_eq!(commands, BTreeSet::from(["000#0102".to_owned(), "000#0202".to_owned()]));
+    assert!(gateway.node(1).status().operational(), "node 1 runs on");
+}
+
+#[test]
+fn mbpoll_and_pymodbus_read_every_published_block() {
+    let _bus = take_the_bus();
+    let _device = simulator(1, &[]);
+    let gateway = Setup::one_detcon().start();
+    gateway.node(1).wait_for_status("good data", |status| status.all_good());
+
+    for (table, address, count) in [
+        (Table::Input, 0, 100),
+        (Table::Holding, 0, 100),
+        (Table::Input, 100, 31),
+        (Table::Input, 140, 23),
+        (Table::Input, 170, 18),
+        (Table::Input, 200, 46),
+        (Table::Holding, 200, 46),
+        (Table::Discrete, 0, 23),
+        (Table::Discrete, 32, 20),
+        (Table::Discrete, 64, 20),
+        (Table::Discrete, 96, 20),
+        (Table::Discrete, 128, 64),
+        (Table::Coil, 0, 7),
+    ] {
+        let what = format!("{table:?} {address}+{count} of unit 1");
+        let by_mbpoll =
+            mbpoll(gateway.modbus, 1, table, address, count).unwrap_or_else(|e| panic!("{what}: {e}"));
+        let by_pymodbus =
+            pymodbus(gateway.modbus, 1, table, address, count).unwrap_or_else(|e| panic!("{what}: {e}"));
+        assert_eq!((by_mbpoll.len(), by_pymodbus.len()), (usize::from(count), usize::from(count)), "{what}");
+    }
+    for unit in [0, 247, 255] {
+        for (address, count) in [(0, 36), (90, 10), (200, 100)] {
+            let what = format!("input registers {address}+{count} of unit {unit}");
+            pymodbus(gateway.modbus, unit, Table::Input, address, count)
+                .unwrap_or_else(|e| panic!("{what}: {e}"));
+            let values = mbpoll(gateway.modbus, unit, Table::Input, address, count);
+            assert_eq!(values.unwrap_or_else(|e| panic!("{what}: {e}")).len(), usize::from(count), "{what}");
+        }
+    }
+    // The test pattern, by a client that knows nothing of us.
+    assert_eq!(
+        mbpoll(gateway.modbus, 247, Table::Input, 90, 5),
+        Ok(vec![0x1234, 0x1234, 0x5678, 0x449A, 0x5000]),
+        "0x1234, 0x12345678, 1234.5"
+    );
+    let identification = pymodbus_identification(gateway.modbus, 247).unwrap();
+    assert!(identification["0"].is_string() && identification["1"].is_string(), "{identification}");
+    let unknown = pymodbus(gateway.modbus, 77, Table::Input, 0, 1);
+    assert!(unknown.as_ref().is_err_and(|error| error.contains("11")), "exception 0x0B: {unknown:?}");
+
+    // The three ways to read a value agree: 0.01 %, raw, as bits of one and the same frame.
+    wait_until("an integer and a raw value of the same frame", || {
+        let (scaled, raw) = (gateway.node(1).input(100, 8), gateway.node(1).input(140, 8));
+        scaled
+            .iter()
+            .zip(&raw)
+            .all(|(scaled, raw)| (u32::from(*raw) * 10000 + 127) / 255 == u32::from(*scaled))
+    });
+}
