@@ -1,11 +1,19 @@
 //! The gateway's four verbs.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 
+use super::bus::Bus;
+use super::conditions::Conditions;
+use super::events::{EventLog, Name};
+use super::marks::Marks;
+use super::node::Node;
+use super::tags::Tags;
 use super::{Command, Outcome};
 use crate::can::{BusEvent, BusIndex, CanFrame};
-use crate::mapping::TagTable;
-use crate::process_image::ProcessImage;
+use crate::canopen::{PdoIndex, Role};
+use crate::mapping::{AlarmOwner, BuiltIn, TagTable};
+use crate::process_image::{NodeIndex, ProcessImage, Quality, Revision};
 use crate::time::{Instant, Now};
 
 /// What the gateway is told.
@@ -55,40 +63,230 @@ pub enum Output {
 /// The core of the program.
 #[derive(Debug)]
 pub struct Gateway {
-    _table: Arc<TagTable>,
+    pub(super) table: Arc<TagTable>,
+    pub(super) buses: Vec<Bus>,
+    pub(super) nodes: Vec<Node>,
+    pub(super) tags: Tags,
+    pub(super) conditions: Conditions,
+    pub(super) events: EventLog,
+    pub(super) health: Health,
+    pub(super) dirty_nodes: Marks,
+    pub(super) dirty_buses: Marks,
+    /// Taken after each input, so that it holds what one input causes and no more.
+    pub(super) outputs: VecDeque<Output>,
+    /// When alarms that are held back are to be looked at again.
+    pub(super) next_look: Option<Instant>,
 }
 
 impl Gateway {
     /// A gateway that has seen nothing yet.
     #[must_use]
-    pub fn new(table: Arc<TagTable>, _now: Now) -> Self {
-        Self { _table: table }
+    pub fn new(table: Arc<TagTable>, now: Now) -> Self {
+        let buses = (0..table.buses.len()).map(|bus| Bus::new(&table, BusIndex(bus), now)).collect();
+        let is_passive = |bus: BusIndex| table.buses.get(bus.0).is_none_or(|bus| bus.role == Role::Passive);
+        let nodes: Vec<Node> = table.nodes.iter().map(|node| Node::new(node, is_passive(node.bus))).collect();
+        let mut gateway = Self {
+            buses,
+            tags: Tags::new(&table, now),
+            conditions: Conditions::new(&table),
+            events: EventLog::new(Arc::clone(&table)),
+            health: Health::default(),
+            dirty_nodes: Marks::new(nodes.len()),
+            dirty_buses: Marks::new(table.buses.len()),
+            outputs: VecDeque::new(),
+            next_look: None,
+            nodes,
+            table,
+        };
+        gateway.events.record(now, AlarmOwner::Gateway, Name::Word("gateway_started"), |_| ());
+        for bus in 0..gateway.buses.len() {
+            gateway.drain_network(now, BusIndex(bus));
+            gateway.refresh_nodes_of(now, BusIndex(bus));
+        }
+        gateway.settle(now);
+        gateway
     }
 
-    /// An image of the right size, in which nothing was ever received.
+    /// The nodes of a bus are made up by a simulator: status bit 6 of their node blocks says so.
+    pub fn mark_simulated(&mut self, bus: BusIndex) {
+        for (place, (node, def)) in self.nodes.iter_mut().zip(&self.table.nodes).enumerate() {
+            if def.bus == bus {
+                node.status.simulated = true;
+                self.dirty_nodes.mark(place);
+            }
+        }
+    }
+
+    /// An image of the right size that shows what is known now; right after [`new`](Self::new): nothing.
     #[must_use]
     pub fn empty_image(&self) -> ProcessImage {
-        ProcessImage::default()
+        let table = &self.table;
+        let mut image = ProcessImage::new(0, 0, 0, table.alarms.len());
+        image.tags = self.tags.shown(table);
+        image.nodes = self.nodes.iter().map(|node| node.status.clone()).collect();
+        image.buses = self.buses.iter().map(|bus| bus.status).collect();
+        image
     }
 
     /// Takes what came in.
-    pub fn handle_input(&mut self, _now: Now, _input: Input) {}
+    pub fn handle_input(&mut self, now: Now, input: Input) {
+        match input {
+            Input::Bus { bus, event } => self.bus_event(bus, &event),
+            Input::Command(command) => self.command(now, command),
+            Input::Health(health) => self.set_health(now, health),
+        }
+    }
+
+    /// The queue of frames to a bus was full, so that a frame of ours could not even be handed over.
+    pub fn handle_refused(&mut self, now: Now, bus: BusIndex, frame: &CanFrame) {
+        self.bus_refused(now, bus, frame);
+        self.settle(now);
+    }
 
     /// What became due.
-    pub fn handle_timeout(&mut self, _now: Now) {}
+    pub fn handle_timeout(&mut self, now: Now) {
+        for bus in (0..self.buses.len()).map(BusIndex) {
+            // First the bus, then its nodes: the cause before what follows from it.
+            self.check_silence(now, bus);
+            let network = self.buses.get_mut(bus.0).map(|bus| &mut bus.network);
+            if let Some(network) = network
+                && network.poll_timeout().is_some_and(|(due, _)| due <= now.instant)
+            {
+                network.handle_timeout(now);
+                self.drain_network(now, bus);
+            }
+        }
+        if self.next_look.is_some_and(|due| due <= now.instant) {
+            self.next_look = None;
+            for bus in 0..self.buses.len() {
+                self.refresh_nodes_of(now, BusIndex(bus));
+            }
+        }
+        self.tags.handle_timeout(&self.table, now);
+        self.conditions.handle_timeout(now);
+        self.events.handle_timeout(now);
+        self.settle(now);
+    }
 
     /// What is to be done; call until `None`.
     pub fn poll_output(&mut self) -> Option<Output> {
-        None
+        self.outputs.pop_front()
     }
 
     /// When `handle_timeout` is to be called at the latest, and why.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<(Instant, &'static str)> {
-        None
+        let networks = self.buses.iter().filter_map(|bus| bus.network.poll_timeout());
+        let silences = self.buses.iter().filter_map(|bus| Some((bus.silent_at()?, "bus silence")));
+        let own = [
+            (self.next_look, "alarm held back"),
+            (self.tags.poll_timeout(), "next second"),
+            (self.conditions.poll_timeout(), "alarm delay"),
+            (self.events.poll_timeout(), "folded events"),
+        ];
+        let own = own.into_iter().filter_map(|(due, why)| Some((due?, why)));
+        networks.chain(silences).chain(own).min_by_key(|(due, _)| *due)
     }
 
     /// Copies all that changed since the last call into the image, and appends the new events to its journal.
+    /// The revision counts up where a reader has something new to see; that the same value came again, and the
+    /// counters and times that move with every frame, are copied too but wake nobody.
     /// Allocates nothing when only values changed.
-    pub fn publish(&mut self, _image: &mut ProcessImage) {}
+    pub fn publish(&mut self, image: &mut ProcessImage) {
+        let revision = Revision(image.revision.0 + 1);
+        let mut moved = self.tags.publish(&self.table, image, revision);
+        for place in self.dirty_nodes.drain() {
+            let (Some(node), Some(shown)) = (self.nodes.get(place), image.nodes.get_mut(place)) else {
+                continue;
+            };
+            moved |= shown.update(&node.status, revision);
+        }
+        for place in self.dirty_buses.drain() {
+            if let (Some(bus), Some(shown)) = (self.buses.get(place), image.buses.get_mut(place)) {
+                moved |= *shown != bus.status;
+                *shown = bus.status;
+            }
+        }
+        moved |= self.conditions.publish(&mut image.alarms, revision);
+        for event in self.events.drain() {
+            image.journal.append(event);
+            moved = true;
+        }
+        let mqtt_connected = self.health.mqtt_connected == Some(true);
+        moved |= image.mqtt_connected != mqtt_connected;
+        moved |= image.clock_synchronised != self.health.clock_synchronised;
+        image.mqtt_connected = mqtt_connected;
+        image.clock_synchronised = self.health.clock_synchronised;
+        if moved {
+            image.revision = revision;
+        }
+    }
+
+    fn bus_event(&mut self, bus: BusIndex, event: &BusEvent) {
+        let at = match *event {
+            BusEvent::Frame { frame, at } => {
+                self.bus_frame(at, bus, &frame);
+                at
+            }
+            BusEvent::Link { link, at } => {
+                self.bus_link(at, bus, link);
+                at
+            }
+            BusEvent::NotSent { frame, at } => {
+                self.bus_not_sent(at, bus, &frame);
+                at
+            }
+            BusEvent::Counters { counters, at } => {
+                self.bus_counters(at, bus, counters);
+                at
+            }
+        };
+        self.settle(at);
+    }
+
+    fn set_health(&mut self, now: Now, health: Health) {
+        let before = std::mem::replace(&mut self.health, health);
+        let word = |up| match up {
+            None => "not_configured",
+            Some(false) => "disconnected",
+            Some(true) => "connected",
+        };
+        if before.mqtt_connected != health.mqtt_connected {
+            self.events.record(now, AlarmOwner::Gateway, Name::Word("mqtt"), |event| {
+                word(before.mqtt_connected).clone_into(&mut event.from);
+                word(health.mqtt_connected).clone_into(&mut event.to);
+            });
+        }
+        let down = health.mqtt_connected == Some(false);
+        self.conditions.set(now, AlarmOwner::Gateway, BuiltIn::MqttDown, down);
+        self.settle(now);
+    }
+
+    /// The tags of a node, or of one of its TPDOs, can be trusted less.
+    pub(super) fn degrade(&mut self, now: Now, node: NodeIndex, pdo: Option<PdoIndex>, quality: Quality) {
+        if self.tags.degrade(&self.table, now, node, pdo, quality)
+            && let Some(node) = self.nodes.get_mut(node.0)
+        {
+            node.status.generation = node.status.generation.wrapping_add(1);
+        }
+        self.dirty_nodes.mark(node.0);
+    }
+
+    /// Carries changes of tags on to the alarms, and those of alarms to the journal.
+    pub(super) fn settle(&mut self, now: Now) {
+        for (tag, level) in self.tags.drain_edges() {
+            let Some(def) = self.table.tag(tag) else { continue };
+            self.events.record(now, AlarmOwner::Node(def.node), Name::Edge(tag), |event| {
+                event.from = (!level).to_string();
+                event.to = level.to_string();
+            });
+        }
+        for tag in self.tags.drain_changed() {
+            self.conditions.tag_changed(tag);
+        }
+        self.conditions.evaluate(now, &self.table, self.tags.samples());
+        while let Some(transition) = self.conditions.poll_transition() {
+            self.events.record_transition(&transition);
+        }
+    }
 }

@@ -3,12 +3,24 @@
 //! One struct, [`Gateway`], one input at a time. The task's law: one input, then `poll_output` until `None`, then
 //! `publish` into the process image, then wait.
 //!
-//! - [`command`]: what a northbound can ask for.
-//! - `core`: the four verbs. `node`: one node's part. `derived`: computed tags. `conditions`: built-in alarms.
-//! - `task` \[IO\]: owns the gateway and the image's writer.
+//! - [`command`]: what a northbound can ask for. `operate`: what comes of it.
+//! - `core`: the four verbs.
+//! - `bus`: one bus; `node` and `node_event`: one node.
+//! - `tags`: the value of every tag; `derived`: computed tags.
+//! - `conditions`: what raises alarms. `events`: on the way to the journal.
+//! - `marks`: which places changed.
 
+mod bus;
 pub mod command;
+mod conditions;
 pub mod core;
+mod derived;
+mod events;
+mod marks;
+mod node;
+mod node_event;
+mod operate;
+mod tags;
 
 pub use command::{Action, Command, CommandSource, Outcome};
 pub use core::{Gateway, Health, Input, Output};

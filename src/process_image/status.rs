@@ -10,7 +10,7 @@ pub struct NodeStatus {
     pub online: bool,
     /// Why it is not online, or not operational, in words for the operator; empty when all is well.
     pub reason: String,
-    /// The last NMT state that it reported; `None` before the first.
+    /// The NMT state that it reported last; `None` before the first and while it is not online.
     pub nmt: Option<NmtState>,
     /// Guarding or heartbeat is configured and answered in time.
     pub supervised: bool,
@@ -28,8 +28,40 @@ pub struct NodeStatus {
     pub newest_data: Option<Timestamp>,
     /// Counts up with every change of this node's data: a reader of several blocks can see that they belong together.
     pub generation: u64,
-    /// When anything of this node changed last.
+    /// When anything of this node changed last, but for the counters and times that move with every frame.
     pub revision: Revision,
+}
+
+impl NodeStatus {
+    /// Copies a newer status. Where more changed than what moves with every frame, `revision` is noted and the answer
+    /// is `true`. Allocates nothing unless the reason is another.
+    pub fn update(&mut self, newer: &Self, revision: Revision) -> bool {
+        let Self { online, reason, nmt, supervised, identity_mismatch, simulated, passive, .. } = newer;
+        let facts = [*online, *supervised, *identity_mismatch, *simulated, *passive];
+        let shown = [self.online, self.supervised, self.identity_mismatch, self.simulated, self.passive];
+        let counters = NodeCounters { frames_received: self.counters.frames_received, ..newer.counters };
+        let stale =
+            |status: &Self| status.pdos.iter().fold(0_u64, |bits, pdo| bits << 1 | u64::from(pdo.stale));
+        let moved = facts != shown
+            || self.reason != *reason
+            || self.nmt != *nmt
+            || self.counters != counters
+            || self.generation != newer.generation
+            || stale(self) != stale(newer);
+        if self.reason != *reason {
+            self.reason.clone_from(reason);
+        }
+        [self.online, self.supervised, self.identity_mismatch, self.simulated, self.passive] = facts;
+        self.nmt = *nmt;
+        self.pdos.clone_from(&newer.pdos);
+        self.counters = newer.counters;
+        self.newest_data = newer.newest_data;
+        self.generation = newer.generation;
+        if moved {
+            self.revision = revision;
+        }
+        moved
+    }
 }
 
 /// What is known of one TPDO.

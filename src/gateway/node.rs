@@ -1,0 +1,192 @@
+//! One node: what is known of it, and what readers and alarms are told of that.
+//!
+//! What each event of its network does to it is in `node_event`.
+
+use super::Gateway;
+use crate::canopen::{ErrorControl, NmtState};
+use crate::mapping::{AlarmOwner, BuiltIn, NodeDef};
+use crate::process_image::{NodeIndex, NodeStatus, PdoStatus, Quality, Reason};
+use crate::time::{Instant, Now};
+
+/// What the gateway remembers of a node beside what readers see.
+#[derive(Debug)]
+pub(super) struct Node {
+    pub(super) status: NodeStatus,
+    /// The last state that it reported, or was seen to be in.
+    pub(super) nmt: Option<NmtState>,
+    /// A frame came since the bus came up, and the node was not reported as never seen.
+    pub(super) contact: bool,
+    pub(super) never_seen: bool,
+    pub(super) lost: Option<Loss>,
+    /// Start commands without effect.
+    pub(super) start_failed: Option<u32>,
+    pub(super) stop_ordered: bool,
+    pub(super) reset_ordered: bool,
+    pub(super) duplicate: bool,
+    pub(super) last_toggle_error: Option<Instant>,
+    /// Guard requests stay without answer: until then it will have answered, or be lost.
+    pub(super) suspect_until: Option<Instant>,
+    /// By TPDO: set reserved bits of the last frame.
+    pub(super) reserved: Vec<u64>,
+    /// By TPDO: that it is too long has been told.
+    pub(super) told_too_long: Vec<bool>,
+}
+
+/// How a node was lost.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Loss {
+    Silence,
+    StuckToggle,
+}
+
+impl Node {
+    pub(super) fn new(def: &NodeDef, passive: bool) -> Self {
+        let pdos = &def.canopen.pdos;
+        let status = NodeStatus {
+            passive,
+            pdos: pdos.iter().map(|pdo| PdoStatus { number: pdo.number, ..PdoStatus::default() }).collect(),
+            ..NodeStatus::default()
+        };
+        Self {
+            status,
+            nmt: None,
+            contact: false,
+            never_seen: false,
+            lost: None,
+            start_failed: None,
+            stop_ordered: false,
+            reset_ordered: false,
+            duplicate: false,
+            last_toggle_error: None,
+            suspect_until: None,
+            reserved: vec![0; pdos.len()],
+            told_too_long: vec![false; pdos.len()],
+        }
+    }
+
+    /// How far data that comes now can be trusted (R-DET-037, P22).
+    pub(super) fn quality_of_new_data(&self) -> Quality {
+        if self.lost.is_some() {
+            Quality::Uncertain(Reason::NodeLost)
+        } else if self.duplicate {
+            Quality::Uncertain(Reason::DuplicateNode)
+        } else {
+            Quality::Good
+        }
+    }
+
+    /// Its bus cannot be used any more: whether it is there is not known until a frame comes.
+    pub(super) fn lose_contact(&mut self) {
+        self.contact = false;
+        self.suspect_until = None;
+    }
+
+    /// Whether frames are to be expected of it all the time.
+    pub(super) fn is_expected(&self, def: &NodeDef) -> bool {
+        let sends_pdos = def.canopen.pdos.iter().any(|pdo| pdo.timeout.is_some());
+        let may_send = matches!(self.nmt, None | Some(NmtState::Operational));
+        def.canopen.error_control != ErrorControl::None || (sends_pdos && may_send)
+    }
+
+    /// TPDOs are not expected any more.
+    pub(super) fn clear_stale_pdos(&mut self) {
+        self.status.pdos.iter_mut().for_each(|pdo| pdo.stale = false);
+    }
+
+    /// Why it is not online, or not as it should be; empty when all is well.
+    pub(super) fn reason(&self, def: &NodeDef, bus_trouble: Option<&str>) -> String {
+        let id = def.canopen.id;
+        if let Some(trouble) = bus_trouble {
+            return trouble.to_owned();
+        }
+        if self.never_seen {
+            return format!(
+                "no frame from node {id} since the gateway started; possible causes: power or cable, the device is \
+                 not in its CANopen mode, another node id, another bit rate"
+            );
+        }
+        match self.lost {
+            Some(Loss::StuckToggle) => {
+                return format!(
+                    "node {id} answers guarding with a toggle bit that does not change; its CPU may be dead, or \
+                     another master guards it too"
+                );
+            }
+            Some(Loss::Silence) => {
+                let silent = match def.canopen.error_control {
+                    ErrorControl::Guarding(_) => "does not answer guarding",
+                    ErrorControl::Heartbeat { .. } => "sends no heartbeat",
+                    ErrorControl::None => "is silent",
+                };
+                return format!("node {id} {silent}; check its power and cable");
+            }
+            None => {}
+        }
+        if !self.contact {
+            return "waiting for its first frame".to_owned();
+        }
+        if let Some(attempts) = self.start_failed {
+            return format!("{attempts} start commands had no effect");
+        }
+        match self.nmt {
+            Some(NmtState::Stopped) if self.stop_ordered => return "stopped by a command".to_owned(),
+            Some(state @ (NmtState::Stopped | NmtState::PreOperational | NmtState::Initialising)) => {
+                return format!("not operational: {}", state.word());
+            }
+            Some(NmtState::Operational) | None => {}
+        }
+        let stale: Vec<String> = self
+            .status
+            .pdos
+            .iter()
+            .filter(|pdo| pdo.stale)
+            .map(|pdo| format!("TPDO{}", pdo.number))
+            .collect();
+        if !stale.is_empty() {
+            return format!("does not come: {}", stale.join(", "));
+        }
+        if self.duplicate { format!("two nodes seem to share the node id {id}") } else { String::new() }
+    }
+}
+
+impl Gateway {
+    /// Works out what readers and alarms are told of a node, from all that is known of it and of its bus.
+    pub(super) fn refresh_node(&mut self, now: Now, index: NodeIndex) {
+        let Some(def) = self.table.nodes.get(index.0) else { return };
+        let bus_trouble = self.bus_trouble(def.bus);
+        let quiet_until = self.quiet_until(now, def.bus);
+        let Some(node) = self.nodes.get_mut(index.0) else { return };
+        let status = &mut node.status;
+        status.online = node.contact && node.lost.is_none() && bus_trouble.is_none();
+        status.nmt = node.nmt.filter(|_| status.online);
+        status.supervised = status.nmt.is_some() && def.canopen.error_control != ErrorControl::None;
+        node.status.reason = node.reason(def, bus_trouble.as_deref());
+        self.dirty_nodes.mark(index.0);
+
+        let owner = AlarmOwner::Node(index);
+        let suspect_until = node.suspect_until.filter(|until| *until > now.instant);
+        let (lost, never_seen) = (node.lost.is_some(), node.never_seen);
+        let (start_failed, duplicate) = (node.start_failed.is_some(), node.duplicate);
+        self.raise(now, owner, BuiltIn::NodeLost, lost, quiet_until);
+        self.conditions.set(now, owner, BuiltIn::NodeNeverSeen, never_seen);
+        self.conditions.set(now, owner, BuiltIn::NotOperational, start_failed);
+        self.conditions.set(now, owner, BuiltIn::DuplicateNode, duplicate);
+        let pdos = self.nodes.get(index.0).map_or(0, |node| node.status.pdos.len());
+        for pdo in 0..pdos {
+            let status = self.nodes.get(index.0).and_then(|node| node.status.pdos.get(pdo));
+            let stale = status.is_some_and(|pdo| pdo.stale);
+            self.raise(now, owner, BuiltIn::PdoTimeout(pdo), stale, quiet_until.or(suspect_until));
+        }
+    }
+
+    /// Sets a condition, but holds a new one back while the cause may turn out to be another: one cause, one alarm.
+    /// A node of which guarding misses replies may be lost altogether, and a quiet bus may have no node left at all.
+    fn raise(&mut self, now: Now, owner: AlarmOwner, condition: BuiltIn, holds: bool, held: Option<Instant>) {
+        match held {
+            Some(until) if holds && !self.conditions.is_set(owner, condition) => {
+                self.next_look = Some(self.next_look.map_or(until, |next| next.min(until)));
+            }
+            Some(_) | None => self.conditions.set(now, owner, condition, holds),
+        }
+    }
+}

@@ -1,0 +1,366 @@
+//! What each event of a node does: to its tags, its counters, its status, its alarms and the journal.
+
+use super::Gateway;
+use super::events::Name;
+use super::node::{Loss, Node};
+use crate::can::{CanFrame, CanId};
+use crate::canopen::{ErrorControl, NmtRequest, NmtState, NodeEvent, PdoIndex};
+use crate::mapping::{AlarmOwner, BuiltIn};
+use crate::process_image::{Event, NodeCounters, NodeIndex, Quality, Reason, Value};
+use crate::time::Now;
+
+/// Wrong toggle bits within so many guard times of each other raise the alarm (N02).
+const TOGGLE_WINDOW: u32 = 10;
+
+impl Gateway {
+    /// Takes an event of a node.
+    pub(super) fn node_event(&mut self, now: Now, index: NodeIndex, event: &NodeEvent) {
+        let at = (now, index);
+        match *event {
+            NodeEvent::FrameSeen => return self.frame_seen(at),
+            NodeEvent::Pdo { pdo, data, length } => return self.pdo(at, pdo, data, length),
+            NodeEvent::PdoLength { pdo, received, discarded } => {
+                self.pdo_length(at, pdo, received, discarded);
+            }
+            NodeEvent::PdoTimeout { pdo } => self.pdo_timeout(at, pdo),
+            NodeEvent::PdoInUnexpectedState { pdo, state } => self.pdo_in_unexpected_state(at, pdo, state),
+            NodeEvent::Malformed { frame } => self.malformed(at, &frame),
+            NodeEvent::Seen => self.seen(at),
+            NodeEvent::NeverSeen => self.never_seen(at),
+            NodeEvent::State { from, to, ordered } => self.state(at, from, to, ordered),
+            NodeEvent::Restarted => self.restarted(at),
+            NodeEvent::InvalidState { raw } => self.invalid_state(at, raw),
+            NodeEvent::UnsolicitedState => {
+                self.tell(at, "unsolicited_state", |event| {
+                    event.text = "the node told its state though nobody had asked".into();
+                });
+            }
+            NodeEvent::GuardMissed { consecutive } => self.guard_missed(at, consecutive),
+            NodeEvent::ToggleError { consecutive } => self.toggle_error(at, consecutive),
+            NodeEvent::Lost { stuck_toggle } => self.lost(at, stuck_toggle),
+            NodeEvent::Recovered => self.recovered(at),
+            NodeEvent::ForeignGuardMaster => self.foreign_guard_master(at),
+            NodeEvent::DuplicateSuspected { evidence } => self.duplicate_suspected(at, evidence),
+            NodeEvent::DuplicateCleared => {
+                self.change(index, |node| node.duplicate = false);
+                self.tell(at, "duplicate_node_cleared", |_| ());
+            }
+            NodeEvent::NmtSent { request } => self.nmt_sent(at, request),
+            NodeEvent::StartFailed { attempts } => {
+                self.change(index, |node| node.start_failed = Some(attempts));
+                self.tell(at, "node_start_failed", |event| {
+                    event.text = format!("{attempts} start commands had no effect");
+                });
+            }
+            NodeEvent::StartSucceeded => {
+                self.change(index, |node| node.start_failed = None);
+                self.tell(at, "node_start_succeeded", |_| ());
+            }
+            NodeEvent::Emergency { code, register, vendor } => self.emergency(at, code, register, vendor),
+        }
+        self.refresh_node(now, index);
+    }
+
+    fn frame_seen(&mut self, (now, index): (Now, NodeIndex)) {
+        let Some(node) = self.nodes.get_mut(index.0) else { return };
+        let counters = &mut node.status.counters;
+        counters.frames_received = counters.frames_received.saturating_add(1);
+        self.dirty_nodes.mark(index.0);
+        if !std::mem::replace(&mut node.contact, true) {
+            self.refresh_node(now, index);
+        }
+    }
+
+    fn pdo(&mut self, at: (Now, NodeIndex), pdo: PdoIndex, mut data: [u8; 8], length: u8) {
+        let (now, index) = at;
+        let (Some(def), Some(node)) = (self.table.nodes.get(index.0), self.nodes.get_mut(index.0)) else {
+            return;
+        };
+        let Some(status) = node.status.pdos.get_mut(pdo.0) else { return };
+        status.last_received = Some(now.instant);
+        status.received = status.received.saturating_add(1);
+        let was_stale = std::mem::take(&mut status.stale);
+        let number = status.number;
+        node.status.newest_data = Some(now.utc);
+        let quality = node.quality_of_new_data();
+
+        if let Some(padding) = data.get_mut(usize::from(length)..) {
+            padding.fill(0);
+        }
+        let reserved = def.reserved_bits.get(pdo.0).copied().unwrap_or(0) & u64::from_le_bytes(data);
+        let before = node.reserved.get_mut(pdo.0).map(|before| std::mem::replace(before, reserved));
+        let used = data.get(..usize::from(length)).unwrap_or(&data);
+        if self.tags.apply_pdo(&self.table, now, (index, pdo), used, quality) {
+            node.status.generation = node.status.generation.wrapping_add(1);
+        }
+        self.dirty_nodes.mark(index.0);
+        if reserved != 0 {
+            self.count(index, |counters| &mut counters.reserved_bits);
+            if before != Some(reserved) {
+                self.tell(at, "reserved_bits", |event| {
+                    event.value = Some(Value::Unsigned(reserved));
+                    event.text = format!("TPDO{number} has bits set that are reserved: 0x{reserved:016X}");
+                });
+            }
+        }
+        if was_stale {
+            self.tell(at, "pdo_recovered", |event| event.text = format!("TPDO{number} comes again"));
+            self.refresh_node(now, index);
+        }
+    }
+
+    fn pdo_length(&mut self, at: (Now, NodeIndex), pdo: PdoIndex, received: u8, discarded: bool) {
+        let (now, index) = at;
+        let settings = self.table.nodes.get(index.0).and_then(|def| def.canopen.pdos.get(pdo.0));
+        let Some((number, expected)) = settings.map(|pdo| (pdo.number, pdo.length)) else { return };
+        self.count(index, |counters| &mut counters.pdo_length_errors);
+        self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::PdoLength);
+        let too_long = received > expected;
+        if too_long {
+            let told = self.nodes.get_mut(index.0).and_then(|node| node.told_too_long.get_mut(pdo.0));
+            if told.is_some_and(|told| std::mem::replace(told, true)) {
+                return;
+            }
+        }
+        let name = if too_long { "pdo_length_exceeded" } else { "pdo_length_error" };
+        self.tell(at, name, |event| {
+            let consequence = if discarded { "discarded" } else { "the bytes beyond are ignored" };
+            event.value = Some(Value::Unsigned(received.into()));
+            event.text = format!("TPDO{number} has {received} bytes instead of {expected}: {consequence}");
+        });
+    }
+
+    fn pdo_timeout(&mut self, at: (Now, NodeIndex), pdo: PdoIndex) {
+        let (now, index) = at;
+        self.change(index, |node| {
+            if let Some(status) = node.status.pdos.get_mut(pdo.0) {
+                status.stale = true;
+            }
+        });
+        self.degrade(now, index, Some(pdo), Quality::Stale(Reason::PdoTimeout));
+        let number = self.pdo_number(index, pdo);
+        self.tell(at, "pdo_timeout", |event| event.text = format!("TPDO{number} did not come in time"));
+    }
+
+    fn pdo_in_unexpected_state(&mut self, at: (Now, NodeIndex), pdo: PdoIndex, state: Option<NmtState>) {
+        self.count(at.1, |counters| &mut counters.unexpected_states);
+        let number = self.pdo_number(at.1, pdo);
+        self.tell(at, "pdo_in_unexpected_state", |event| {
+            state_word(state).clone_into(&mut event.from);
+            event.text = format!("TPDO{number} came though the node was not known to be operational");
+        });
+    }
+
+    fn malformed(&mut self, at: (Now, NodeIndex), frame: &CanFrame) {
+        self.count(at.1, |counters| &mut counters.malformed);
+        if frame.is_remote() || matches!(frame.id(), CanId::Extended(_)) {
+            self.count_foreign_frame_of(at.1);
+        }
+        self.tell(at, "malformed_frame", |event| event.text = format!("{frame} was not decoded"));
+    }
+
+    fn seen(&mut self, at: (Now, NodeIndex)) {
+        self.change(at.1, |node| {
+            node.never_seen = false;
+            node.contact = true;
+        });
+        self.tell(at, "node_seen", |_| ());
+    }
+
+    fn never_seen(&mut self, at: (Now, NodeIndex)) {
+        self.change(at.1, |node| {
+            node.never_seen = true;
+            node.contact = false;
+        });
+        let (def, node) = (self.table.nodes.get(at.1.0), self.nodes.get(at.1.0));
+        let reason = def.zip(node).map(|(def, node)| node.reason(def, None)).unwrap_or_default();
+        self.tell(at, "node_never_seen", |event| event.text = reason);
+    }
+
+    fn state(&mut self, at: (Now, NodeIndex), from: Option<NmtState>, to: NmtState, ordered: bool) {
+        let (now, index) = at;
+        let operational = to == NmtState::Operational;
+        self.change(index, |node| {
+            node.nmt = Some(to);
+            if operational {
+                node.start_failed = None;
+            } else {
+                node.clear_stale_pdos();
+            }
+        });
+        if !operational {
+            self.degrade(now, index, None, Quality::Stale(Reason::NodeNotOperational));
+        }
+        if !ordered {
+            self.count(index, |counters| &mut counters.unexpected_states);
+        }
+        let name = if ordered { "state" } else { "node_state_unexpected" };
+        self.tell(at, name, |event| {
+            state_word(from).clone_into(&mut event.from);
+            to.word().clone_into(&mut event.to);
+        });
+    }
+
+    fn restarted(&mut self, at: (Now, NodeIndex)) {
+        let (now, index) = at;
+        let mut ordered = false;
+        self.change(index, |node| {
+            node.clear_stale_pdos();
+            node.told_too_long.fill(false);
+            ordered = std::mem::take(&mut node.reset_ordered);
+        });
+        self.count(index, |counters| &mut counters.restarts);
+        self.degrade(now, index, None, Quality::Stale(Reason::NodeRestarted));
+        self.tell(at, "node_restarted", |event| {
+            let cause = if ordered { "after a reset command" } else { "unasked" };
+            event.text = format!("the node restarted {cause}");
+        });
+        if !ordered {
+            self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::Restarted);
+        }
+    }
+
+    fn invalid_state(&mut self, at: (Now, NodeIndex), raw: u8) {
+        self.count(at.1, |counters| &mut counters.unexpected_states);
+        self.tell(at, "node_state_invalid", |event| {
+            event.value = Some(Value::Unsigned(raw.into()));
+            event.to = raw.to_string();
+            event.text = format!("the node reports state {raw}, which CiA 301 does not define");
+        });
+    }
+
+    fn guard_missed(&mut self, (now, index): (Now, NodeIndex), consecutive: u16) {
+        self.count(index, |counters| &mut counters.guard_misses);
+        self.suspect(now, index, consecutive);
+    }
+
+    fn toggle_error(&mut self, at: (Now, NodeIndex), consecutive: u16) {
+        let (now, index) = at;
+        self.count(index, |counters| &mut counters.toggle_errors);
+        let guard_time = match self.table.nodes.get(index.0).map(|def| &def.canopen.error_control) {
+            Some(ErrorControl::Guarding(guarding)) => guarding.guard_time,
+            Some(ErrorControl::Heartbeat { .. } | ErrorControl::None) | None => return,
+        };
+        let mut before = None;
+        self.change(index, |node| before = node.last_toggle_error.replace(now.instant));
+        if before.is_some_and(|before| now.instant.since(before) <= guard_time * TOGGLE_WINDOW) {
+            self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::GuardToggle);
+        }
+        self.suspect(now, index, consecutive);
+        self.tell(at, "toggle_error", |event| {
+            event.text = "a guard reply had the toggle bit of the one before".into();
+        });
+    }
+
+    /// A node that misses its first reply will have answered, or be lost, within its life time.
+    fn suspect(&mut self, now: Now, index: NodeIndex, consecutive: u16) {
+        let Some(def) = self.table.nodes.get(index.0) else { return };
+        let ErrorControl::Guarding(guarding) = &def.canopen.error_control else { return };
+        let life_time = guarding.guard_time * u32::from(guarding.life_time_factor) + guarding.reply_timeout;
+        if consecutive == 1 {
+            self.change(index, |node| node.suspect_until = Some(now.instant + life_time));
+        }
+    }
+
+    fn lost(&mut self, at: (Now, NodeIndex), stuck_toggle: bool) {
+        let (now, index) = at;
+        let loss = if stuck_toggle { Loss::StuckToggle } else { Loss::Silence };
+        self.change(index, |node| {
+            node.lost = Some(loss);
+            node.suspect_until = None;
+        });
+        self.degrade(now, index, None, Quality::Bad(Reason::NodeLost));
+        let (def, node) = (self.table.nodes.get(index.0), self.nodes.get(index.0));
+        let reason = def.zip(node).map(|(def, node)| node.reason(def, None)).unwrap_or_default();
+        self.tell(at, "node_lost", |event| event.text = reason);
+    }
+
+    fn recovered(&mut self, at: (Now, NodeIndex)) {
+        self.change(at.1, |node| {
+            node.lost = None;
+            node.contact = true;
+            node.suspect_until = None;
+        });
+        self.tell(at, "node_recovered", |_| ());
+    }
+
+    fn foreign_guard_master(&mut self, at: (Now, NodeIndex)) {
+        if self.is_master_of(at.1) {
+            self.conditions.pulse(at.0, AlarmOwner::Node(at.1), BuiltIn::ForeignGuardMaster);
+        }
+        self.tell(at, "foreign_guard_master", |event| {
+            event.text = "somebody else sends guard requests to this node; both see wrong toggle bits".into();
+        });
+    }
+
+    fn duplicate_suspected(&mut self, at: (Now, NodeIndex), evidence: &'static str) {
+        self.change(at.1, |node| node.duplicate = true);
+        self.degrade(at.0, at.1, None, Quality::Uncertain(Reason::DuplicateNode));
+        self.tell(at, "duplicate_node", |event| evidence.clone_into(&mut event.text));
+    }
+
+    fn nmt_sent(&mut self, at: (Now, NodeIndex), request: NmtRequest) {
+        self.count(at.1, |counters| &mut counters.nmt_commands_sent);
+        self.change(at.1, |node| match request {
+            NmtRequest::Start => node.stop_ordered = false,
+            NmtRequest::Stop => {
+                node.stop_ordered = true;
+                node.start_failed = None;
+            }
+            NmtRequest::EnterPreOperational => {}
+            NmtRequest::ResetNode | NmtRequest::ResetCommunication => node.reset_ordered = true,
+        });
+        self.tell(at, "nmt_command_sent", |event| request_word(request).clone_into(&mut event.to));
+    }
+
+    fn emergency(&mut self, at: (Now, NodeIndex), code: u16, register: u8, vendor: [u8; 5]) {
+        self.count(at.1, |counters| &mut counters.emcys);
+        self.tell(at, "emergency", |event| {
+            event.value = Some(Value::Unsigned(code.into()));
+            event.to = format!("0x{code:04X}");
+            let vendor = vendor.map(|byte| format!("{byte:02X}")).concat();
+            event.text = format!(
+                "error code 0x{code:04X}, error register 0x{register:02X}, manufacturer bytes {vendor}"
+            );
+        });
+    }
+
+    fn change(&mut self, index: NodeIndex, change: impl FnOnce(&mut Node)) {
+        if let Some(node) = self.nodes.get_mut(index.0) {
+            change(node);
+        }
+    }
+
+    fn count(&mut self, index: NodeIndex, counter: impl FnOnce(&mut NodeCounters) -> &mut u64) {
+        if let Some(node) = self.nodes.get_mut(index.0) {
+            let counter = counter(&mut node.status.counters);
+            *counter = counter.saturating_add(1);
+            self.dirty_nodes.mark(index.0);
+        }
+    }
+
+    fn tell(&mut self, (now, index): (Now, NodeIndex), name: &'static str, fill: impl FnOnce(&mut Event)) {
+        self.events.record(now, AlarmOwner::Node(index), Name::Word(name), fill);
+    }
+
+    /// The number of a TPDO as users know it.
+    fn pdo_number(&self, index: NodeIndex, pdo: PdoIndex) -> u16 {
+        let settings = self.table.nodes.get(index.0).and_then(|def| def.canopen.pdos.get(pdo.0));
+        settings.map_or(0, |pdo| pdo.number)
+    }
+}
+
+fn state_word(state: Option<NmtState>) -> &'static str {
+    state.map_or("unknown", NmtState::word)
+}
+
+/// The word of an NMT command in events.
+pub(super) fn request_word(request: NmtRequest) -> &'static str {
+    match request {
+        NmtRequest::Start => "start",
+        NmtRequest::Stop => "stop",
+        NmtRequest::EnterPreOperational => "enter_pre_operational",
+        NmtRequest::ResetNode => "reset_node",
+        NmtRequest::ResetCommunication => "reset_communication",
+    }
+}

@@ -1,0 +1,124 @@
+//! What operators ask for: checked, done, journalled, answered.
+
+use super::core::{Gateway, Output};
+use super::node_event::request_word;
+use super::{Action, Command, CommandSource, Outcome};
+use crate::alarms::AcknowledgeError;
+use crate::canopen::{NmtRequest, Role};
+use crate::mapping::AlarmOwner;
+use crate::process_image::{AlarmIndex, NodeIndex};
+use crate::time::Now;
+
+impl Gateway {
+    /// Does what is asked for, if it is allowed; the journal tells who asked and what came of it.
+    pub(super) fn command(&mut self, now: Now, command: Command) {
+        let Command { id, source, action } = command;
+        let (name, about, outcome, what) = match action {
+            Action::Nmt { node, request } => {
+                let outcome = self.request_nmt(now, node, request);
+                ("nmt", self.owner_of_node(node), outcome, request_word(request).to_owned())
+            }
+            Action::Acknowledge { alarm } => {
+                let outcome = match self.conditions.list_mut().acknowledge(now, alarm) {
+                    Ok(()) => Outcome::Done,
+                    Err(AcknowledgeError::Unknown) => Outcome::Unknown,
+                    Err(error @ AcknowledgeError::NothingToAcknowledge) => {
+                        Outcome::Rejected(error.to_string())
+                    }
+                };
+                ("acknowledge", self.owner_of_alarm(alarm), outcome, self.name_of_alarm(alarm))
+            }
+            Action::AcknowledgeAll { node } => {
+                let outcome = self.acknowledge_all(now, node);
+                let about = node.map_or(AlarmOwner::Gateway, |node| self.owner_of_node(node));
+                ("acknowledge_all", about, outcome, String::new())
+            }
+            Action::Reset { alarm } => {
+                let outcome = if alarm.0 >= self.table.alarms.len() {
+                    Outcome::Unknown
+                } else if self.conditions.list_mut().reset(now, alarm) {
+                    Outcome::Done
+                } else {
+                    Outcome::Rejected("the alarm is not latched, or not acknowledged yet".into())
+                };
+                ("reset", self.owner_of_alarm(alarm), outcome, self.name_of_alarm(alarm))
+            }
+        };
+        self.events.record_command(now, about, name, |event| {
+            event.from = source_text(&source);
+            outcome_word(&outcome).clone_into(&mut event.to);
+            event.text = match &outcome {
+                Outcome::Rejected(reason) if what.is_empty() => reason.clone(),
+                Outcome::Rejected(reason) => format!("{what}: {reason}"),
+                Outcome::Done | Outcome::Unknown | Outcome::Busy | Outcome::NodeUnavailable => what,
+            };
+        });
+        self.outputs.push_back(Output::Reply { id, outcome });
+        self.settle(now);
+    }
+
+    fn request_nmt(&mut self, now: Now, node: NodeIndex, request: NmtRequest) -> Outcome {
+        let Some(def) = self.table.nodes.get(node.0) else { return Outcome::Unknown };
+        let Some(bus_def) = self.table.buses.get(def.bus.0) else { return Outcome::Unknown };
+        let (id, index) = (def.canopen.id, def.bus);
+        if bus_def.role == Role::Passive {
+            return Outcome::Rejected(format!(
+                "the gateway is passive on bus `{}`: it sends nothing there",
+                bus_def.name
+            ));
+        }
+        let Some(bus) = self.buses.get_mut(index.0) else { return Outcome::Unknown };
+        if !bus.is_up() {
+            return Outcome::NodeUnavailable;
+        }
+        let accepted = bus.network.request_nmt(now, Some(id), request);
+        self.drain_network(now, index);
+        if accepted { Outcome::Done } else { Outcome::Rejected("the network does not allow it".into()) }
+    }
+
+    /// Acknowledges every alarm that waits for it, and opens latches whose source is not set any more.
+    fn acknowledge_all(&mut self, now: Now, node: Option<NodeIndex>) -> Outcome {
+        if node.is_some_and(|node| node.0 >= self.table.nodes.len()) {
+            return Outcome::Unknown;
+        }
+        let of = node.map(AlarmOwner::Node);
+        for (place, alarm) in self.table.alarms.iter().enumerate() {
+            if of.is_none_or(|of| of == alarm.owner) {
+                // That most alarms wait for nothing is no fault of this request.
+                let _ = self.conditions.list_mut().acknowledge(now, AlarmIndex(place));
+            }
+        }
+        self.tags.acknowledge_latches(&self.table, now, node);
+        Outcome::Done
+    }
+
+    fn owner_of_node(&self, node: NodeIndex) -> AlarmOwner {
+        if node.0 < self.table.nodes.len() { AlarmOwner::Node(node) } else { AlarmOwner::Gateway }
+    }
+
+    fn owner_of_alarm(&self, alarm: AlarmIndex) -> AlarmOwner {
+        self.table.alarms.get(alarm.0).map_or(AlarmOwner::Gateway, |alarm| alarm.owner)
+    }
+
+    fn name_of_alarm(&self, alarm: AlarmIndex) -> String {
+        self.table.alarms.get(alarm.0).map(|alarm| alarm.name.clone()).unwrap_or_default()
+    }
+}
+
+fn source_text(source: &CommandSource) -> String {
+    match source {
+        CommandSource::Modbus(who) => format!("modbus {who}"),
+        CommandSource::Mqtt(who) => format!("mqtt {who}"),
+        CommandSource::Web(who) => format!("web {who}"),
+    }
+}
+
+fn outcome_word(outcome: &Outcome) -> &'static str {
+    match outcome {
+        Outcome::Done => "done",
+        Outcome::Unknown => "unknown",
+        Outcome::Rejected(_) => "rejected",
+        Outcome::Busy => "busy",
+        Outcome::NodeUnavailable => "node_unavailable",
+    }
+}

@@ -1,0 +1,384 @@
+//! The current value of every tag: decoding, qualities, and which derived tags have to be computed again.
+//!
+//! Nothing here allocates once it is made. What depends on what is worked out at the start; after that a TPDO
+//! touches its own tags and those that are computed from them, and no others.
+
+use crate::canopen::PdoIndex;
+use crate::mapping::{FieldKind, Scale, Source, TagTable, codec};
+use crate::process_image::{NodeIndex, ProcessImage, Quality, Reason, Revision, Sample, TagIndex, Value};
+use crate::time::{Instant, Now};
+
+use super::derived::{self, Memory};
+use super::marks::Marks;
+
+/// All tags.
+#[derive(Debug)]
+pub(super) struct Tags {
+    layout: Layout,
+    state: State,
+}
+
+/// What depends on what.
+#[derive(Debug)]
+struct Layout {
+    nodes: Vec<NodeLayout>,
+    /// By tag: the derived tags that look at it.
+    dependents: Vec<Vec<TagIndex>>,
+}
+
+#[derive(Debug)]
+struct NodeLayout {
+    /// By TPDO.
+    pdos: Vec<PdoLayout>,
+    /// In the order of the table: inputs come before what is computed from them.
+    derived: Vec<TagIndex>,
+}
+
+#[derive(Debug, Default)]
+struct PdoLayout {
+    /// Tags that stand in it.
+    tags: Vec<TagIndex>,
+    /// Tags that are computed from those, however indirectly.
+    computed: Vec<TagIndex>,
+}
+
+#[derive(Debug)]
+struct State {
+    samples: Vec<Sample>,
+    /// By tag; unused for tags that are not derived.
+    memories: Vec<Memory>,
+    /// By tag: an input has changed since it was computed.
+    outdated: Vec<bool>,
+    /// Not yet published.
+    unpublished: Marks,
+    /// Value or quality changed since conditions were looked at.
+    changed: Marks,
+    /// Edges of counted bits.
+    edges: Vec<(TagIndex, bool)>,
+    /// Tags that change by mere time.
+    running: Marks,
+    next_second: Option<Instant>,
+}
+
+impl Tags {
+    /// All tags as they are before anything was received.
+    pub(super) fn new(table: &TagTable, now: Now) -> Self {
+        let layout = Layout::new(table);
+        let size = table.tags.len();
+        let mut state = State {
+            samples: table.tags.iter().map(|tag| never_received(&tag.source)).collect(),
+            memories: (0..size).map(|_| Memory::default()).collect(),
+            outdated: vec![true; size],
+            unpublished: Marks::new(size),
+            changed: Marks::new(size),
+            edges: Vec::new(),
+            running: Marks::new(size),
+            next_second: None,
+        };
+        for (tag, sample) in table.tags.iter().zip(&mut state.samples) {
+            if matches!(&tag.source, Source::Derived(crate::mapping::Derived::Constant { .. })) {
+                sample.received = now.utc;
+                sample.received_at = Some(now.instant);
+            }
+        }
+        for node in &layout.nodes {
+            state.compute_outdated(table, &layout, node, now);
+        }
+        Self { layout, state }
+    }
+
+    /// The current samples, by tag.
+    pub(super) fn samples(&self) -> &[Sample] {
+        &self.state.samples
+    }
+
+    /// Takes a TPDO: its tags, and all that is computed from them. Whether a value or a quality changed.
+    pub(super) fn apply_pdo(
+        &mut self,
+        table: &TagTable,
+        now: Now,
+        (node, pdo): (NodeIndex, PdoIndex),
+        data: &[u8],
+        quality: Quality,
+    ) -> bool {
+        let Self { layout, state } = self;
+        let Some(node) = layout.nodes.get(node.0) else { return false };
+        let Some(pdo) = node.pdos.get(pdo.0) else { return false };
+        let mut changed = false;
+        for tag in &pdo.tags {
+            let Some(Source::Pdo { field, scale, .. }) = table.tag(*tag).map(|tag| &tag.source) else {
+                continue;
+            };
+            let Some(raw) = codec::decode(field, data) else { continue };
+            changed |= state.store(layout, *tag, raw, codec::scale(scale, raw), quality);
+            state.receive(*tag, now);
+        }
+        for tag in &pdo.computed {
+            state.receive(*tag, now);
+        }
+        changed | state.compute_outdated(table, layout, node, now)
+    }
+
+    /// The tags of a node, or of one of its TPDOs, can be trusted less from now on. A quality never gets better this
+    /// way: only newly received data makes a tag good again (R-DET-037). Whether anything changed.
+    pub(super) fn degrade(
+        &mut self,
+        table: &TagTable,
+        now: Now,
+        node: NodeIndex,
+        pdo: Option<PdoIndex>,
+        quality: Quality,
+    ) -> bool {
+        let Self { layout, state } = self;
+        let Some(node) = layout.nodes.get(node.0) else { return false };
+        let pdos = node.pdos.iter().enumerate();
+        let of = pdos.filter(|(place, _)| pdo.is_none_or(|pdo| pdo.0 == *place));
+        let mut changed = false;
+        for tag in of.flat_map(|(_, pdo)| &pdo.tags) {
+            let Some(sample) = state.samples.get(tag.0).copied() else { continue };
+            let worse = degraded(sample.quality, quality);
+            changed |= state.store(layout, *tag, sample.raw, sample.value, worse);
+        }
+        changed | state.compute_outdated(table, layout, node, now)
+    }
+
+    /// Opens the latches of a node, or of all nodes, whose source is not set.
+    pub(super) fn acknowledge_latches(&mut self, table: &TagTable, now: Now, node: Option<NodeIndex>) {
+        let Self { layout, state } = self;
+        let nodes = layout.nodes.iter().enumerate();
+        for (_, node) in nodes.filter(|(place, _)| node.is_none_or(|node| node.0 == *place)) {
+            for tag in &node.derived {
+                let opened = state.memories.get_mut(tag.0).is_some_and(Memory::acknowledge);
+                if let (true, Some(outdated)) = (opened, state.outdated.get_mut(tag.0)) {
+                    *outdated = true;
+                }
+            }
+            state.compute_outdated(table, layout, node, now);
+        }
+    }
+
+    /// Values that change by mere time are computed once a second, while there are any.
+    pub(super) fn handle_timeout(&mut self, table: &TagTable, now: Now) {
+        if self.state.next_second.is_none_or(|due| due > now.instant) {
+            return;
+        }
+        let Self { layout, state } = self;
+        state.next_second = None;
+        for tag in state.running.drain() {
+            if let Some(outdated) = state.outdated.get_mut(tag) {
+                *outdated = true;
+            }
+        }
+        for node in &layout.nodes {
+            state.compute_outdated(table, layout, node, now);
+        }
+    }
+
+    /// When the next second is due.
+    pub(super) fn poll_timeout(&self) -> Option<Instant> {
+        self.state.next_second
+    }
+
+    /// Takes the tags of which value or quality changed.
+    pub(super) fn drain_changed(&mut self) -> impl Iterator<Item = TagIndex> + '_ {
+        self.state.changed.drain().map(TagIndex)
+    }
+
+    /// Takes the edges of counted bits.
+    pub(super) fn drain_edges(&mut self) -> impl Iterator<Item = (TagIndex, bool)> + '_ {
+        self.state.edges.drain(..)
+    }
+
+    /// Copies what was received or changed since the last call. `true` when a value or a quality is another.
+    pub(super) fn publish(&mut self, table: &TagTable, image: &mut ProcessImage, revision: Revision) -> bool {
+        let State { samples, unpublished, .. } = &mut self.state;
+        let mut moved = false;
+        for place in unpublished.drain() {
+            let (Some(sample), Some(shown)) = (samples.get(place), image.tags.get_mut(place)) else {
+                continue;
+            };
+            let sample = as_shown(table, TagIndex(place), sample);
+            if same(&sample, shown) {
+                *shown = Sample { revision: shown.revision, ..sample };
+            } else {
+                *shown = Sample { revision, ..sample };
+                moved = true;
+            }
+        }
+        moved
+    }
+
+    /// All tags as readers see them.
+    pub(super) fn shown(&self, table: &TagTable) -> Vec<Sample> {
+        let samples = self.state.samples.iter().enumerate();
+        samples.map(|(place, sample)| as_shown(table, TagIndex(place), sample)).collect()
+    }
+}
+
+impl Layout {
+    fn new(table: &TagTable) -> Self {
+        let mut dependents: Vec<Vec<TagIndex>> = vec![Vec::new(); table.tags.len()];
+        for (place, tag) in table.tags.iter().enumerate() {
+            if let Source::Derived(derived) = &tag.source {
+                for input in derived::inputs(derived) {
+                    if let Some(dependents) = dependents.get_mut(input.0) {
+                        dependents.push(TagIndex(place));
+                    }
+                }
+            }
+        }
+        let nodes = table.nodes.iter().map(|node| {
+            let tags =
+                || node.tags.clone().filter_map(|place| Some((TagIndex(place), table.tags.get(place)?)));
+            let pdos = (0..node.canopen.pdos.len()).map(|number| {
+                let is_in = |source: &Source| matches!(source, Source::Pdo { pdo, .. } if *pdo == number);
+                let tags: Vec<TagIndex> =
+                    tags().filter(|(_, tag)| is_in(&tag.source)).map(|(tag, _)| tag).collect();
+                let computed = computed_from(&tags, &dependents);
+                PdoLayout { tags, computed }
+            });
+            NodeLayout {
+                pdos: pdos.collect(),
+                derived: tags()
+                    .filter(|(_, tag)| matches!(tag.source, Source::Derived(_)))
+                    .map(|(tag, _)| tag)
+                    .collect(),
+            }
+        });
+        let nodes = nodes.collect();
+        Self { nodes, dependents }
+    }
+}
+
+/// All tags that are computed from some tags, however indirectly.
+fn computed_from(tags: &[TagIndex], dependents: &[Vec<TagIndex>]) -> Vec<TagIndex> {
+    let mut found = std::collections::BTreeSet::new();
+    let mut next = tags.to_vec();
+    while let Some(tag) = next.pop() {
+        for dependent in dependents.get(tag.0).into_iter().flatten() {
+            if found.insert(*dependent) {
+                next.push(*dependent);
+            }
+        }
+    }
+    found.into_iter().collect()
+}
+
+impl State {
+    /// Whether value or quality is another than before; then all that is computed from it is outdated.
+    fn store(&mut self, layout: &Layout, tag: TagIndex, raw: Value, value: Value, quality: Quality) -> bool {
+        let Some(sample) = self.samples.get_mut(tag.0) else { return false };
+        let new = Sample { raw, value, quality, ..*sample };
+        if same(&new, sample) {
+            return false;
+        }
+        *sample = new;
+        self.unpublished.mark(tag.0);
+        self.changed.mark(tag.0);
+        for dependent in layout.dependents.get(tag.0).into_iter().flatten() {
+            if let Some(outdated) = self.outdated.get_mut(dependent.0) {
+                *outdated = true;
+            }
+        }
+        true
+    }
+
+    /// New data came for the tag.
+    fn receive(&mut self, tag: TagIndex, now: Now) {
+        if let Some(sample) = self.samples.get_mut(tag.0) {
+            sample.received = now.utc;
+            sample.received_at = Some(now.instant);
+            self.unpublished.mark(tag.0);
+        }
+    }
+
+    fn compute_outdated(&mut self, table: &TagTable, layout: &Layout, node: &NodeLayout, now: Now) -> bool {
+        let mut changed = false;
+        for tag in &node.derived {
+            let outdated = self.outdated.get_mut(tag.0).is_some_and(std::mem::take);
+            if outdated {
+                changed |= self.compute(table, layout, *tag, now);
+            }
+        }
+        changed
+    }
+
+    fn compute(&mut self, table: &TagTable, layout: &Layout, tag: TagIndex, now: Now) -> bool {
+        let Some(Source::Derived(derived)) = table.tag(tag).map(|tag| &tag.source) else { return false };
+        let Some(memory) = self.memories.get_mut(tag.0) else { return false };
+        let (computed, edge) = derived::evaluate(now, derived, memory, &self.samples);
+        if derived::runs_with_time(derived, memory, now) {
+            self.running.mark(tag.0);
+            let next = Instant::from_millis((now.instant.as_millis() / 1_000 + 1) * 1_000);
+            self.next_second = Some(self.next_second.map_or(next, |due| due.min(next)));
+        }
+        self.edges.extend(edge);
+        self.store(layout, tag, computed.raw, computed.value, computed.quality)
+    }
+}
+
+/// The quality of a tag after something happened that makes it no better than `new`.
+fn degraded(current: Quality, new: Quality) -> Quality {
+    let rank = |quality| match quality {
+        Quality::Good => 0,
+        Quality::Uncertain(_) => 1,
+        Quality::Stale(_) => 2,
+        Quality::Bad(_) => 3,
+    };
+    // "Never received" stays the truth whatever else goes wrong. Within the same rank the newest reason is the one
+    // to tell, but that a node is not operational says less than that it restarted or fell silent.
+    let tells_less = new.reason() == Some(Reason::NodeNotOperational);
+    if current == Quality::NEVER || rank(new) < rank(current) || (rank(new) == rank(current) && tells_less) {
+        current
+    } else {
+        new
+    }
+}
+
+/// A sample as readers see it: zero instead of a value that cannot be used, where the node asks for that (R-DET-084).
+fn as_shown(table: &TagTable, tag: TagIndex, sample: &Sample) -> Sample {
+    let zero_on_bad =
+        table.tag(tag).and_then(|tag| table.node(tag.node)).is_some_and(|node| node.zero_on_bad);
+    if zero_on_bad && !sample.quality.is_usable() {
+        Sample { raw: zero(sample.raw), value: zero(sample.value), ..*sample }
+    } else {
+        *sample
+    }
+}
+
+fn zero(value: Value) -> Value {
+    match value {
+        Value::Bool(_) => Value::Bool(false),
+        Value::Unsigned(_) => Value::Unsigned(0),
+        Value::Signed(_) => Value::Signed(0),
+        Value::Float(_) => Value::Float(0.0),
+    }
+}
+
+/// The same value and quality; a NaN is the same as itself here, so that it is no change for ever.
+fn same(left: &Sample, right: &Sample) -> bool {
+    let same_value = |left, right| match (left, right) {
+        (Value::Float(left), Value::Float(right)) => f64::to_bits(left) == f64::to_bits(right),
+        (left, right) => left == right,
+    };
+    left.quality == right.quality && same_value(left.raw, right.raw) && same_value(left.value, right.value)
+}
+
+/// A sample of the right kind in which nothing was received.
+fn never_received(source: &Source) -> Sample {
+    let (raw, scale) = match source {
+        Source::Pdo { field, scale, .. } => {
+            let raw = match field.kind {
+                FieldKind::Bool => Value::Bool(false),
+                FieldKind::Unsigned => Value::Unsigned(0),
+                FieldKind::Signed => Value::Signed(0),
+                FieldKind::Float => Value::Float(0.0),
+            };
+            (raw, *scale)
+        }
+        Source::Derived(_) => (Value::Unsigned(0), Scale::IDENTITY),
+    };
+    let value = codec::scale(&scale, raw);
+    // What the offset of a scale makes of a zero was never measured.
+    Sample { raw, value: zero(value), ..Sample::NEVER }
+}
