@@ -94,9 +94,11 @@ impl Bus {
 /// How long a node that is well can be silent.
 fn longest_silence(node: &NodeSettings) -> Option<Duration> {
     match &node.error_control {
-        ErrorControl::Guarding(guarding) => Some(guarding.guard_time * 3),
+        ErrorControl::Guarding(guarding) if !guarding.guard_time.is_zero() => Some(guarding.guard_time * 3),
         ErrorControl::Heartbeat { timeout } => Some(*timeout),
-        ErrorControl::None => node.pdos.iter().filter_map(|pdo| pdo.timeout).min(),
+        ErrorControl::Guarding(_) | ErrorControl::None => {
+            node.pdos.iter().filter_map(|pdo| pdo.timeout).min()
+        }
     }
 }
 

@@ -16,6 +16,8 @@ mod conditions;
 pub mod core;
 mod derived;
 mod events;
+#[cfg(test)]
+mod fixture;
 mod marks;
 mod node;
 mod node_event;

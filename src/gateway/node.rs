@@ -3,7 +3,7 @@
 //! What each event of its network does to it is in `node_event`.
 
 use super::Gateway;
-use crate::canopen::{ErrorControl, NmtState};
+use crate::canopen::{ErrorControl, NmtState, PdoIndex};
 use crate::mapping::{AlarmOwner, BuiltIn, NodeDef};
 use crate::process_image::{NodeIndex, NodeStatus, PdoStatus, Quality, Reason};
 use crate::time::{Instant, Now};
@@ -21,7 +21,10 @@ pub(super) struct Node {
     /// Start commands without effect.
     pub(super) start_failed: Option<u32>,
     pub(super) stop_ordered: bool,
-    pub(super) reset_ordered: bool,
+    /// A frame came at any time since the gateway started.
+    pub(super) ever_seen: bool,
+    /// The journal tells that it was lost.
+    pub(super) told_lost: bool,
     pub(super) duplicate: bool,
     pub(super) last_toggle_error: Option<Instant>,
     /// Guard requests stay without answer: until then it will have answered, or be lost.
@@ -55,7 +58,8 @@ impl Node {
             lost: None,
             start_failed: None,
             stop_ordered: false,
-            reset_ordered: false,
+            ever_seen: false,
+            told_lost: false,
             duplicate: false,
             last_toggle_error: None,
             suspect_until: None,
@@ -85,7 +89,7 @@ impl Node {
     pub(super) fn is_expected(&self, def: &NodeDef) -> bool {
         let sends_pdos = def.canopen.pdos.iter().any(|pdo| pdo.timeout.is_some());
         let may_send = matches!(self.nmt, None | Some(NmtState::Operational));
-        def.canopen.error_control != ErrorControl::None || (sends_pdos && may_send)
+        is_watched(def) || (sends_pdos && may_send)
     }
 
     /// TPDOs are not expected any more.
@@ -99,7 +103,7 @@ impl Node {
         if let Some(trouble) = bus_trouble {
             return trouble.to_owned();
         }
-        if self.never_seen {
+        if self.never_seen || (self.lost.is_some() && !self.ever_seen) {
             return format!(
                 "no frame from node {id} since the gateway started; possible causes: power or cable, the device is \
                  not in its CANopen mode, another node id, another bit rate"
@@ -149,6 +153,15 @@ impl Node {
     }
 }
 
+/// Whether guarding or heartbeat is configured (R-DET-031: a guard time of zero is no guarding).
+fn is_watched(def: &NodeDef) -> bool {
+    match &def.canopen.error_control {
+        ErrorControl::Guarding(guarding) => !guarding.guard_time.is_zero(),
+        ErrorControl::Heartbeat { .. } => true,
+        ErrorControl::None => false,
+    }
+}
+
 impl Gateway {
     /// Works out what readers and alarms are told of a node, from all that is known of it and of its bus.
     pub(super) fn refresh_node(&mut self, now: Now, index: NodeIndex) {
@@ -159,13 +172,14 @@ impl Gateway {
         let status = &mut node.status;
         status.online = node.contact && node.lost.is_none() && bus_trouble.is_none();
         status.nmt = node.nmt.filter(|_| status.online);
-        status.supervised = status.nmt.is_some() && def.canopen.error_control != ErrorControl::None;
+        status.supervised = status.nmt.is_some() && is_watched(def);
         node.status.reason = node.reason(def, bus_trouble.as_deref());
         self.dirty_nodes.mark(index.0);
 
         let owner = AlarmOwner::Node(index);
         let suspect_until = node.suspect_until.filter(|until| *until > now.instant);
-        let (lost, never_seen) = (node.lost.is_some(), node.never_seen);
+        // A node that never was there was not lost: that has an alarm of its own, which names other causes.
+        let (lost, never_seen) = (node.lost.is_some() && node.ever_seen, node.never_seen);
         let (start_failed, duplicate) = (node.start_failed.is_some(), node.duplicate);
         self.raise(now, owner, BuiltIn::NodeLost, lost, quiet_until);
         self.conditions.set(now, owner, BuiltIn::NodeNeverSeen, never_seen);
@@ -183,10 +197,32 @@ impl Gateway {
     /// A node of which guarding misses replies may be lost altogether, and a quiet bus may have no node left at all.
     fn raise(&mut self, now: Now, owner: AlarmOwner, condition: BuiltIn, holds: bool, held: Option<Instant>) {
         match held {
-            Some(until) if holds && !self.conditions.is_set(owner, condition) => {
-                self.next_look = Some(self.next_look.map_or(until, |next| next.min(until)));
-            }
+            Some(until) if holds && !self.conditions.is_set(owner, condition) => self.look_again_at(until),
             Some(_) | None => self.conditions.set(now, owner, condition, holds),
+        }
+    }
+
+    pub(super) fn look_again_at(&mut self, at: Instant) {
+        self.next_look = Some(self.next_look.map_or(at, |next| next.min(at)));
+    }
+
+    /// Data that came while the node was lost is uncertain, and nobody else watches that it goes on coming: when it
+    /// does not, it is as bad as all else of a lost node.
+    pub(super) fn expire_data_of_lost_node(&mut self, now: Now, index: NodeIndex) {
+        let Some(def) = self.table.nodes.get(index.0) else { return };
+        let Some(node) = self.nodes.get(index.0).filter(|node| node.lost.is_some()) else { return };
+        let pdos = def.canopen.pdos.iter().zip(&node.status.pdos).enumerate();
+        let due: Vec<(PdoIndex, Instant)> = pdos
+            .filter_map(|(place, (pdo, status))| {
+                Some((PdoIndex(place), status.last_received? + pdo.timeout?))
+            })
+            .collect();
+        for (pdo, due) in due {
+            if due > now.instant {
+                self.look_again_at(due);
+            } else {
+                self.degrade(now, index, Some(pdo), Quality::Bad(Reason::NodeLost));
+            }
         }
     }
 }

@@ -65,6 +65,7 @@ impl Gateway {
         let Some(node) = self.nodes.get_mut(index.0) else { return };
         let counters = &mut node.status.counters;
         counters.frames_received = counters.frames_received.saturating_add(1);
+        node.ever_seen = true;
         self.dirty_nodes.mark(index.0);
         if !std::mem::replace(&mut node.contact, true) {
             self.refresh_node(now, index);
@@ -83,6 +84,7 @@ impl Gateway {
         let number = status.number;
         node.status.newest_data = Some(now.utc);
         let quality = node.quality_of_new_data();
+        let expires = def.canopen.pdos.get(pdo.0).and_then(|pdo| pdo.timeout).filter(|_| node.lost.is_some());
 
         if let Some(padding) = data.get_mut(usize::from(length)..) {
             padding.fill(0);
@@ -94,6 +96,9 @@ impl Gateway {
             node.status.generation = node.status.generation.wrapping_add(1);
         }
         self.dirty_nodes.mark(index.0);
+        if let Some(timeout) = expires {
+            self.look_again_at(now.instant + timeout);
+        }
         if reserved != 0 {
             self.count(index, |counters| &mut counters.reserved_bits);
             if before != Some(reserved) {
@@ -203,21 +208,11 @@ impl Gateway {
 
     fn restarted(&mut self, at: (Now, NodeIndex)) {
         let (now, index) = at;
-        let mut ordered = false;
-        self.change(index, |node| {
-            node.clear_stale_pdos();
-            node.told_too_long.fill(false);
-            ordered = std::mem::take(&mut node.reset_ordered);
-        });
+        self.change(index, |node| node.told_too_long.fill(false));
         self.count(index, |counters| &mut counters.restarts);
         self.degrade(now, index, None, Quality::Stale(Reason::NodeRestarted));
-        self.tell(at, "node_restarted", |event| {
-            let cause = if ordered { "after a reset command" } else { "unasked" };
-            event.text = format!("the node restarted {cause}");
-        });
-        if !ordered {
-            self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::Restarted);
-        }
+        self.tell(at, "node_restarted", |event| event.text = "the node restarted unasked".into());
+        self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::Restarted);
     }
 
     fn invalid_state(&mut self, at: (Now, NodeIndex), raw: u8) {
@@ -265,23 +260,32 @@ impl Gateway {
     fn lost(&mut self, at: (Now, NodeIndex), stuck_toggle: bool) {
         let (now, index) = at;
         let loss = if stuck_toggle { Loss::StuckToggle } else { Loss::Silence };
+        let mut was_there = false;
         self.change(index, |node| {
             node.lost = Some(loss);
             node.suspect_until = None;
+            node.told_lost = node.ever_seen;
+            was_there = node.ever_seen;
         });
         self.degrade(now, index, None, Quality::Bad(Reason::NodeLost));
         let (def, node) = (self.table.nodes.get(index.0), self.nodes.get(index.0));
         let reason = def.zip(node).map(|(def, node)| node.reason(def, None)).unwrap_or_default();
-        self.tell(at, "node_lost", |event| event.text = reason);
+        if was_there {
+            self.tell(at, "node_lost", |event| event.text = reason);
+        }
     }
 
     fn recovered(&mut self, at: (Now, NodeIndex)) {
+        let mut told_lost = false;
         self.change(at.1, |node| {
             node.lost = None;
             node.contact = true;
             node.suspect_until = None;
+            told_lost = std::mem::take(&mut node.told_lost);
         });
-        self.tell(at, "node_recovered", |_| ());
+        if told_lost {
+            self.tell(at, "node_recovered", |_| ());
+        }
     }
 
     fn foreign_guard_master(&mut self, at: (Now, NodeIndex)) {
@@ -307,8 +311,7 @@ impl Gateway {
                 node.stop_ordered = true;
                 node.start_failed = None;
             }
-            NmtRequest::EnterPreOperational => {}
-            NmtRequest::ResetNode | NmtRequest::ResetCommunication => node.reset_ordered = true,
+            NmtRequest::EnterPreOperational | NmtRequest::ResetNode | NmtRequest::ResetCommunication => {}
         });
         self.tell(at, "nmt_command_sent", |event| request_word(request).clone_into(&mut event.to));
     }
