@@ -1,8 +1,11 @@
 //! Tests of [`Detcon`], in numbers-time, in candump notation.
 
+use proptest::prelude::*;
+
 use super::super::bench::{Bench, in_phase};
 use super::super::values::{Channel, StatusBit};
 use super::*;
+use crate::can::CanId;
 
 fn healthy() -> DetconSettings {
     DetconSettings::default()
@@ -474,4 +477,104 @@ fn a_stalled_process_does_not_make_frames_bunch() {
     while device.poll_output().is_some() {}
     device.handle_timeout(Now::from_millis(60_000));
     assert_eq!(std::iter::from_fn(|| device.poll_output()).count(), 4);
+}
+
+/// What can happen to a device, with the time since what happened before, in ms.
+fn happenings() -> impl Strategy<Value = Vec<(u64, Happening)>> {
+    let frame = (0_u16..=0x7FF, any::<bool>(), proptest::collection::vec(any::<u8>(), 0..=8));
+    let happening = prop_oneof![
+        Just(Happening::Nothing),
+        Just(Happening::Guard),
+        prop_oneof![Just(0x01), Just(0x02), Just(0x80), Just(0x81), Just(0x82), any::<u8>()]
+            .prop_map(Happening::Nmt),
+        frame.prop_map(|(id, remote, data)| {
+            let id = CanId::Standard(id);
+            let frame = if remote {
+                CanFrame::remote_frame(id, u8::try_from(data.len()).unwrap())
+            } else {
+                CanFrame::data_frame(id, &data)
+            };
+            Happening::Frame(frame.unwrap())
+        }),
+        any::<bool>().prop_map(Happening::Power),
+        (any::<u8>(), any::<bool>()).prop_map(|(raw, knock)| Happening::Change(raw, knock)),
+    ];
+    proptest::collection::vec((0_u64..300, happening), 0..200)
+}
+
+#[derive(Clone, Debug)]
+enum Happening {
+    Nothing,
+    Guard,
+    Nmt(u8),
+    Frame(CanFrame),
+    Power(bool),
+    Change(u8, bool),
+}
+
+fn happen(bench: &mut Bench, at: u64, happening: &Happening) {
+    match happening {
+        Happening::Nothing => bench.run_to(at),
+        Happening::Guard => bench.frame(at, "701#R1"),
+        Happening::Nmt(command) => bench.frame(at, &format!("000#{command:02X}00")),
+        Happening::Frame(frame) => bench.frame(at, &frame.to_string()),
+        Happening::Power(on) => bench.power(at, *on),
+        Happening::Change(raw, knock) => bench.update(at, |values| {
+            values.analog_output = *raw;
+            values.knock(channel(18), *knock);
+        }),
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn whatever_happens_tpdo3_keeps_its_inhibit_time_and_replies_alternate(
+        happenings in happenings(),
+        restart in any::<bool>(),
+    ) {
+        // Without replies during initialisation, `00` is a boot-up message and nothing else.
+        let settings =
+            DetconSettings { event_restarts_period: restart, guard_in_boot: false, ..healthy() };
+        let mut bench = Bench::powered(settings);
+        let mut now = 0;
+        for (pause, happening) in &happenings {
+            now += pause;
+            happen(&mut bench, now, happening);
+        }
+        bench.run_to(now + 2000);
+        let log = bench.take();
+        let status: Vec<u64> =
+            log.iter().filter(|(_, frame)| frame.starts_with("381#")).map(|(at, _)| *at).collect();
+        prop_assert!(status.windows(2).all(|pair| pair[1] - pair[0] >= 100), "{:?}", status);
+        let mut expected = 0;
+        for (_, frame) in &log {
+            let Some(data) = frame.strip_prefix("701#") else { continue };
+            let byte = u8::from_str_radix(data, 16).unwrap();
+            if byte == 0 {
+                expected = 0;
+            } else {
+                prop_assert_eq!(byte & 0x80, expected, "{:?}", &log);
+                expected ^= 0x80;
+            }
+        }
+    }
+
+    #[test]
+    fn whatever_time_passes_work_comes_to_an_end(jumps in proptest::collection::vec(any::<u64>(), 0..20)) {
+        let mut device = Detcon::new(NodeId::new(1).unwrap(), healthy());
+        for micros in jumps {
+            let now = Now { instant: Instant::from_micros(micros), ..Now::default() };
+            device.power_on(now);
+            device.update_faults(now, |faults| {
+                faults.second_master = true;
+                faults.boot_loop = Some(Duration::ZERO);
+            });
+            device.handle_frame(now, &"000#0101".parse().unwrap());
+            device.update(now, |values| values.knock(channel(1), micros % 2 == 0));
+            device.handle_timeout(now);
+            while device.poll_output().is_some() {}
+        }
+    }
 }
