@@ -9,15 +9,18 @@
 //! - [`socketcan`] \[IO\]: interfaces of the host, with [`host_link`] \[IO\] (what the host says of them) and, pure,
 //!   [`raw_frame`] (what a socket gives), [`controller`] (the state of the link), [`stamp`] (receive times).
 //! - [`virtual_bus`] \[IO\]: buses inside the process.
+//! - [`task`] \[IO\]: owns one bus, opens it again whenever it was lost, counts; [`outage`] keeps its log short.
 
 pub mod bus;
 pub mod controller;
 pub mod frame;
 pub mod host_link;
 pub mod interface;
+pub mod outage;
 pub mod raw_frame;
 pub mod socketcan;
 pub mod stamp;
+pub mod task;
 pub mod virtual_bus;
 
 use std::future::Future;
@@ -92,7 +95,7 @@ impl Link {
 /// What happened on a bus since the gateway started. All counters saturate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct BusCounters {
-    /// Frames received, of every kind but error frames.
+    /// Classical data and remote frames received.
     pub frames_received: u64,
     /// Frames sent.
     pub frames_sent: u64,
@@ -110,6 +113,17 @@ pub struct BusCounters {
     pub wire_bits: u64,
     /// Bit rate in bit/s, where the interface tells it.
     pub bit_rate: Option<u32>,
+}
+
+impl BusCounters {
+    /// Whether there were errors and never a valid frame, as it is where our bit rate is not that of the bus
+    /// (R-DET-089). Wiring and terminators may be the cause as well.
+    #[must_use]
+    pub fn bit_rate_is_suspect(&self) -> bool {
+        /// A few errors are normal when somebody plugs in a cable.
+        const MANY: u64 = 20;
+        self.frames_received == 0 && (self.bus_off_count > 0 || self.error_frames >= MANY)
+    }
 }
 
 /// What a reader has counted since its bus was opened.
@@ -206,4 +220,21 @@ pub enum BusError {
         /// What the system says.
         source: std::io::Error,
     },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn r_det_089_errors_without_a_valid_frame_make_the_bit_rate_suspect() {
+        let suspect = |frames_received, error_frames, bus_off_count| {
+            BusCounters { frames_received, error_frames, bus_off_count, ..BusCounters::default() }
+                .bit_rate_is_suspect()
+        };
+        assert!(suspect(0, 20, 0));
+        assert!(suspect(0, 0, 1));
+        assert!(!suspect(0, 19, 0));
+        assert!(!suspect(1, 1_000, 5));
+    }
 }
