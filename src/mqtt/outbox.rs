@@ -270,12 +270,6 @@ impl Outbox {
         self.report.messages == 0
     }
 
-    /// Whether a message is sent and not acknowledged.
-    #[must_use]
-    pub fn is_in_flight(&self, id: MessageId) -> bool {
-        self.in_flight.contains_key(&id)
-    }
-
     /// Messages that are sent and not acknowledged.
     #[must_use]
     pub fn in_flight(&self) -> usize {

@@ -197,6 +197,12 @@ impl Publisher {
         self.outbox.report()
     }
 
+    /// Messages that are sent and not acknowledged.
+    #[must_use]
+    pub fn in_flight(&self) -> usize {
+        self.outbox.in_flight()
+    }
+
     /// Whether everything that was to be told has been acknowledged.
     #[must_use]
     pub fn is_idle(&self) -> bool {

@@ -15,6 +15,10 @@ pub const BACK_OFF_FIRST: Duration = Duration::from_secs(1);
 pub const BACK_OFF_LONGEST: Duration = Duration::from_secs(60);
 /// A session must last this long before the waits start again from [`BACK_OFF_FIRST`].
 pub const HEALTHY_AFTER: Duration = Duration::from_secs(60);
+/// Shortest time without an acknowledgement that ends a session.
+pub const SILENCE: Duration = Duration::from_secs(10);
+/// Names that no node may have, because topics of the gateway itself stand there.
+pub const RESERVED_NODE_NAMES: [&str; 2] = ["bridge", "event"];
 
 /// How to reach the broker, and what is kept while it is away.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]

@@ -1,2 +1,3 @@
 //! What several tests need.
+pub mod fake_broker;
 pub mod plant;
