@@ -99,6 +99,28 @@ impl Expression {
     }
 }
 
+impl Expression {
+    /// The same, to change which tags they are.
+    pub fn for_each_tag_mut(&mut self, visit: &mut impl FnMut(&mut TagIndex)) {
+        match self {
+            Self::And(parts) | Self::Or(parts) => {
+                for part in parts {
+                    part.for_each_tag_mut(visit);
+                }
+            }
+            Self::Not(part) => part.for_each_tag_mut(visit),
+            Self::Tag(index) => visit(index),
+            Self::Compare { left, right, .. } => {
+                for side in [left, right] {
+                    if let Operand::Tag(index) = side {
+                        visit(index);
+                    }
+                }
+            }
+        }
+    }
+}
+
 impl Operand {
     fn evaluate(self, tag: &impl Fn(TagIndex) -> (Value, Quality)) -> (f64, Quality) {
         match self {

@@ -32,6 +32,20 @@ pub struct BusEntry {
     pub own_node_id: Option<At<u64>>,
 }
 
+impl BusEntry {
+    /// A bus inside the process, everything else as it is by default.
+    #[must_use]
+    pub fn virtual_bus(name: &str) -> Self {
+        Self {
+            interface: At::nowhere(format!("virtual:{name}")),
+            role: RoleWord::Master,
+            bit_rate: None,
+            start_broadcast: false,
+            own_node_id: None,
+        }
+    }
+}
+
 /// `role`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
@@ -53,7 +67,7 @@ impl From<RoleWord> for Role {
 }
 
 /// `[node.NAME]`.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NodeEntry {
     /// Name of its bus.
@@ -107,6 +121,19 @@ pub struct NodeEntry {
     /// Changes to alarms, of the mapping or built in.
     #[serde(default)]
     pub alarm: BTreeMap<At<String>, AlarmEntry>,
+}
+
+impl NodeEntry {
+    /// A node with nothing but what has no default.
+    #[must_use]
+    pub fn new(bus: &str, id: u8, mapping: &str) -> Self {
+        Self {
+            bus: At::nowhere(bus.to_owned()),
+            id: At::nowhere(id.into()),
+            mapping: At::nowhere(mapping.to_owned()),
+            ..Self::default()
+        }
+    }
 }
 
 /// `[node.NAME.tag.TAG]`: what this installation changes of a tag.

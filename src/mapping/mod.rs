@@ -12,18 +12,27 @@
 //! - [`diagnostic`]: messages about files. `reader`: strict TOML; `suggest`: "did you mean".
 
 mod at;
+pub mod build;
+pub mod builtin;
 pub mod codec;
 pub mod diagnostic;
 pub mod expression;
 pub mod expression_parser;
+pub mod file;
+pub mod file_values;
 pub mod installation;
 pub mod reader;
+pub mod shipped;
 pub mod suggest;
 pub mod table;
+#[cfg(test)]
+pub mod testing;
 
 pub use at::At;
+pub use build::{Installation, build, check_mapping};
 pub use diagnostic::{Diagnostic, Severity, SourceText};
 pub use expression::Expression;
+pub use shipped::{SHIPPED, shipped};
 pub use table::{
     AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, BusDef, Derived, DeviceDef, Encoding, Field, FieldKind,
     NodeDef, OnLoss, PublishDef, RegisterDef, Scale, Source, Space, TagDef, TagTable,

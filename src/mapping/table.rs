@@ -299,6 +299,48 @@ pub enum Derived {
     },
 }
 
+impl Derived {
+    /// The tags that it is computed from.
+    pub fn for_each_input(&self, visit: &mut impl FnMut(TagIndex)) {
+        match self {
+            Self::Bit { of, .. }
+            | Self::RisingEdges { of }
+            | Self::SecondsSinceRise { of }
+            | Self::Latch { of }
+            | Self::EdgesWithin { of, .. } => visit(*of),
+            Self::Pack { of } | Self::Count { of } => of.iter().for_each(|tag| visit(*tag)),
+            Self::Logic { when } => when.for_each_tag(visit),
+            Self::Maximum { among, valid } | Self::ArgMaximum { among, valid, .. } => {
+                among.iter().chain(valid.iter().flatten()).for_each(|tag| visit(*tag));
+            }
+            Self::Margin { among, valid, limit } => {
+                among.iter().chain(valid.iter().flatten()).chain([limit]).for_each(|tag| visit(*tag));
+            }
+            Self::Constant { .. } => {}
+        }
+    }
+
+    /// The same, to change which tags they are.
+    pub fn for_each_input_mut(&mut self, visit: &mut impl FnMut(&mut TagIndex)) {
+        match self {
+            Self::Bit { of, .. }
+            | Self::RisingEdges { of }
+            | Self::SecondsSinceRise { of }
+            | Self::Latch { of }
+            | Self::EdgesWithin { of, .. } => visit(of),
+            Self::Pack { of } | Self::Count { of } => of.iter_mut().for_each(visit),
+            Self::Logic { when } => when.for_each_tag_mut(visit),
+            Self::Maximum { among, valid } | Self::ArgMaximum { among, valid, .. } => {
+                among.iter_mut().chain(valid.iter_mut().flatten()).for_each(visit);
+            }
+            Self::Margin { among, valid, limit } => {
+                among.iter_mut().chain(valid.iter_mut().flatten()).chain([limit]).for_each(visit);
+            }
+            Self::Constant { .. } => {}
+        }
+    }
+}
+
 /// A place in the register map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RegisterDef {

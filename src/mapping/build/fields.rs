@@ -1,0 +1,175 @@
+//! Bits of TPDOs: types, places, overlaps.
+
+use std::ops::Range;
+
+use super::super::SourceText;
+use super::super::file::TagSection;
+use super::super::installation::ByteOrderWord;
+use super::super::table::{Field, FieldKind};
+use super::items::{Entry, Item};
+use super::node::Tpdo;
+use super::problems::Problems;
+use super::tags::{Context, Kind};
+
+/// The kind and width that a type's word stands for.
+fn parse(word: &str) -> Option<(FieldKind, u8)> {
+    let number = |text: &str, lowest: u8| {
+        let plain =
+            text.len() <= 2 && !text.starts_with('0') && text.bytes().all(|byte| byte.is_ascii_digit());
+        text.parse::<u8>().ok().filter(|width| plain && (lowest..=64).contains(width))
+    };
+    match word {
+        "bool" => return Some((FieldKind::Bool, 1)),
+        "f32" => return Some((FieldKind::Float, 32)),
+        "f64" => return Some((FieldKind::Float, 64)),
+        _ => {}
+    }
+    if let Some(width) = word.strip_prefix('u').and_then(|text| number(text, 1)) {
+        return Some((FieldKind::Unsigned, width));
+    }
+    word.strip_prefix('i').and_then(|text| number(text, 2)).map(|width| (FieldKind::Signed, width))
+}
+
+/// The kind of a tag's value.
+pub fn kind(section: &TagSection) -> Kind {
+    match parse(&section.kind.value) {
+        Some((FieldKind::Bool, _)) => Kind::Bool,
+        Some((FieldKind::Unsigned, width)) if section.scale.is_none() => Kind::Bits(width),
+        Some((FieldKind::Unsigned | FieldKind::Signed, width)) => Kind::Whole(width),
+        Some((FieldKind::Float, _)) | None => Kind::Number,
+    }
+}
+
+/// The TPDO and the bits of a tag.
+pub fn field(
+    problems: &mut Problems,
+    context: &Context<'_>,
+    item: &Item<'_>,
+    section: &TagSection,
+) -> (usize, Field) {
+    let source = context.source;
+    let (kind, width) = parse(&section.kind.value).unwrap_or_else(|| {
+        let message = format!("there is no type `{}`", section.kind.value);
+        problems.error(source, &section.kind.span, message, "use bool, u1 to u64, i2 to i64, f32 or f64");
+        (FieldKind::Unsigned, 1)
+    });
+    let stride = section.array.as_ref().and_then(|array| array.value.bit_stride.as_ref());
+    let stride =
+        stride.map_or(u64::from(width), |stride| problems.within(source, stride, "bit_stride", 1..=64));
+    let bit = section.bit.value.saturating_add(item.element.index.saturating_mul(stride));
+    let number = section.tpdo.value;
+    let pdo = context.tpdos.iter().position(|tpdo| tpdo.number == number);
+    match pdo.and_then(|place| context.tpdos.get(place)).map(|tpdo| tpdo.section) {
+        None => {
+            let known: Vec<&str> = context.tpdos.iter().map(|tpdo| tpdo.key.value.as_str()).collect();
+            let hint = if known.is_empty() {
+                "declare it: [tpdo.1]".to_owned()
+            } else {
+                format!("declared are: {}", known.join(", "))
+            };
+            problems.error(source, &section.tpdo.span, format!("there is no [tpdo.{number}]"), hint);
+        }
+        Some(tpdo) => {
+            let bits = tpdo.length.value.min(8) * 8;
+            let last = bit.saturating_add(u64::from(width) - 1);
+            if last >= bits {
+                let message = format!(
+                    "`{}` takes bits {bit} to {last}, but TPDO {number} has only {bits} bits",
+                    item.name
+                );
+                let hint = "byte b bit i is bit 8 b + i; check `bit`, `type` and the `length` of the TPDO";
+                problems.error(source, &section.bit.span, message, hint);
+            }
+        }
+    }
+    let field = Field {
+        bit: u8::try_from(bit).unwrap_or(u8::MAX),
+        width,
+        kind,
+        big_endian: section.byte_order == ByteOrderWord::Big,
+        invert: section.invert,
+    };
+    check_byte_order(problems, source, &section.bit.span, &item.name, field);
+    (pdo.unwrap_or_default(), field)
+}
+
+/// Only whole bytes can be turned round.
+pub fn check_byte_order(
+    problems: &mut Problems,
+    source: &SourceText,
+    span: &Range<usize>,
+    name: &str,
+    field: Field,
+) {
+    if field.big_endian && (!field.bit.is_multiple_of(8) || !field.width.is_multiple_of(8)) {
+        let message =
+            format!("`{name}` does not consist of whole bytes, so byte_order = \"big\" means nothing");
+        problems.error(source, span, message, "give it whole bytes, or leave the byte order out");
+    }
+}
+
+/// Bits of one TPDO that two tags use, or that the maker calls reserved.
+pub fn check_overlaps(problems: &mut Problems, context: &Context<'_>, fields: &[(usize, usize, Field)]) {
+    let mut used: Vec<(usize, Range<u16>, usize)> = fields
+        .iter()
+        .map(|(item, pdo, field)| {
+            let first = u16::from(field.bit);
+            (*pdo, first..first + u16::from(field.width), *item)
+        })
+        .collect();
+    used.sort_by_key(|(pdo, bits, item)| (*pdo, bits.start, *item));
+    for pair in used.windows(2) {
+        let [(pdo, bits, item), (next_pdo, next_bits, next_item)] = pair else { continue };
+        if pdo == next_pdo
+            && next_bits.start < bits.end
+            && let (Some(one), Some(other)) = (context.items.get(*item), context.items.get(*next_item))
+        {
+            let message = format!("`{}` and `{}` share bit {}", one.name, other.name, next_bits.start);
+            problems.warning(context.source, &other.span, message, "check `bit` and `type` of both");
+        }
+    }
+    for (pdo, bits, item) in &used {
+        let reserved = context.tpdos.get(*pdo).map_or(0, Tpdo::reserved_bits);
+        let mask = bits.clone().filter(|bit| *bit < 64).fold(0u64, |mask, bit| mask | 1 << bit);
+        if reserved & mask != 0
+            && let Some(item) = context.items.get(*item)
+        {
+            let message = format!("`{}` uses a bit that reserved_bits names", item.name);
+            problems.warning(context.source, &item.span, message, "take the bit out of one of them");
+        }
+    }
+}
+
+/// The fields of all tags: item, TPDO, bits.
+pub fn all(
+    context: &Context<'_>,
+    tags: &[super::super::table::TagDef],
+    places: &[usize],
+) -> Vec<(usize, usize, Field)> {
+    use super::super::table::Source;
+    let mut fields = Vec::new();
+    for (item, place) in places.iter().enumerate() {
+        if let (Some(Source::Pdo { pdo, field, .. }), Some(Entry::Tag(_))) =
+            (tags.get(*place).map(|tag| &tag.source), context.items.get(item).map(|item| item.entry))
+        {
+            fields.push((item, *pdo, *field));
+        }
+    }
+    fields
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn types_are_bool_whole_numbers_and_floats() {
+        assert_eq!(parse("bool"), Some((FieldKind::Bool, 1)));
+        assert_eq!(parse("u64"), Some((FieldKind::Unsigned, 64)));
+        assert_eq!(parse("i2"), Some((FieldKind::Signed, 2)));
+        assert_eq!(parse("f32"), Some((FieldKind::Float, 32)));
+        for word in ["u0", "u65", "i1", "u08", "f16", "u", "int", "u+8", "u256"] {
+            assert_eq!(parse(word), None, "{word}");
+        }
+    }
+}

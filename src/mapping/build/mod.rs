@@ -1,0 +1,315 @@
+//! From the mapping files and the installation's tables to the tag table, or to everything that is wrong with them.
+//!
+//! - this file: what an installation is, and the way through its buses and nodes.
+//! - `items`: the tags of a mapping, arrays unrolled. `tags`, `fields`, `derived`: what they become.
+//! - `node`: what the CANopen master needs to know.
+//! - `alarms`: alarms, their order and what suppresses them.
+//! - `addresses`, `network`: what must not happen twice among nodes.
+//! - `order`: causes before consequences. `problems`: where messages are collected.
+
+mod addresses;
+mod alarms;
+mod derived;
+mod fields;
+mod items;
+mod network;
+mod node;
+mod order;
+mod problems;
+mod tags;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use self::addresses::Claims;
+use self::items::{Element, Items};
+use self::network::Taken;
+use self::node::Tpdo;
+use self::problems::Problems;
+pub use self::problems::{is_name, is_snake_case};
+use self::tags::Context;
+use super::file::MappingFile;
+use super::installation::{BusEntry, NodeEntry};
+use super::reader::{self, Read};
+use super::shipped::{SHIPPED, shipped};
+use super::suggest::closest;
+use super::table::{BusDef, DeviceDef, NodeDef, PublishDef, TagTable};
+use super::{At, Diagnostic, SourceText};
+use crate::can::BusIndex;
+use crate::canopen::NodeId;
+use crate::process_image::{NodeIndex, TagIndex};
+
+/// Bit rates of CANopen in bit/s (R-DET-089).
+pub const BIT_RATES: [u32; 9] =
+    [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
+/// Bit rate of a bus that says none (R-DET-089).
+pub const DEFAULT_BIT_RATE: u32 = 125_000;
+/// Version of the mapping format that this program reads.
+pub const FORMAT: u64 = 1;
+
+/// All that an installation is made of.
+#[derive(Clone, Copy, Debug)]
+pub struct Installation<'a> {
+    /// Name of the gateway.
+    pub gateway: &'a str,
+    /// The Modbus unit id of the gateway itself, which no node may have.
+    pub gateway_unit_id: u8,
+    /// The configuration file, for positions.
+    pub config: &'a SourceText,
+    /// `[bus.*]`.
+    pub buses: &'a BTreeMap<At<String>, BusEntry>,
+    /// `[node.*]`.
+    pub nodes: &'a BTreeMap<At<String>, NodeEntry>,
+    /// Mapping files by the name that nodes call them; one that is missing here is looked for among the shipped ones.
+    pub mappings: &'a BTreeMap<String, SourceText>,
+}
+
+/// Builds the tag table of an installation; with it come the warnings. Or everything that is wrong, warnings included.
+pub fn build(installation: &Installation<'_>) -> Result<(TagTable, Vec<Diagnostic>), Vec<Diagnostic>> {
+    let mut problems = Problems::default();
+    let buses = buses(&mut problems, installation);
+    let files = mapping_files(&mut problems, installation);
+    let mut builder = Builder {
+        installation,
+        table: TagTable {
+            gateway: installation.gateway.to_owned(),
+            alarms: alarms::of_gateway_and_buses(buses.len()),
+            buses,
+            ..TagTable::default()
+        },
+        taken: Taken::default(),
+        claims: Vec::new(),
+    };
+    for (name, entry) in installation.nodes {
+        builder.node(&mut problems, &files, name, entry);
+    }
+    addresses::check_nodes(&mut problems, installation.config, &builder.claims);
+    if problems.has_errors() { Err(problems.sorted()) } else { Ok((builder.table, problems.sorted())) }
+}
+
+/// Checks one mapping by itself, as if one node of an installation used it. Warnings, or everything that is wrong.
+pub fn check_mapping(source: &SourceText) -> Result<Vec<Diagnostic>, Vec<Diagnostic>> {
+    let config = SourceText::new("", "");
+    let bus = BusEntry::virtual_bus("check");
+    let entry = NodeEntry::new("check", 1, &source.name);
+    let buses = BTreeMap::from([(At::nowhere("check".to_owned()), bus)]);
+    let nodes = BTreeMap::from([(At::nowhere("check".to_owned()), entry)]);
+    let mappings = BTreeMap::from([(source.name.clone(), source.clone())]);
+    let installation = Installation {
+        gateway: "check",
+        gateway_unit_id: 247,
+        config: &config,
+        buses: &buses,
+        nodes: &nodes,
+        mappings: &mappings,
+    };
+    build(&installation).map(|(_, warnings)| warnings)
+}
+
+fn buses(problems: &mut Problems, installation: &Installation<'_>) -> Vec<BusDef> {
+    let config = installation.config;
+    let mut buses = Vec::new();
+    for (name, entry) in installation.buses {
+        problems.name(config, name, "bus");
+        let bit_rate = entry.bit_rate.as_ref().map_or(Some(DEFAULT_BIT_RATE), |bit_rate| {
+            let known = BIT_RATES.into_iter().find(|known| u64::from(*known) == bit_rate.value);
+            if known.is_none() {
+                let message = format!("{} bit/s is no bit rate of CANopen", bit_rate.value);
+                problems.error(config, &bit_rate.span, message, format!("use one of {BIT_RATES:?}"));
+            }
+            known
+        });
+        if let Some(id) = &entry.own_node_id {
+            problems.within(config, id, "own_node_id", 1..=127);
+        }
+        buses.push(BusDef {
+            name: name.value.clone(),
+            role: entry.role.into(),
+            bit_rate: bit_rate.unwrap_or(DEFAULT_BIT_RATE),
+            start_broadcast: entry.start_broadcast,
+        });
+    }
+    buses
+}
+
+/// A mapping file that was read.
+struct ReadMapping {
+    source: SourceText,
+    read: Read<MappingFile>,
+}
+
+fn mapping_files(problems: &mut Problems, installation: &Installation<'_>) -> BTreeMap<String, ReadMapping> {
+    let mut files = BTreeMap::new();
+    let mut names: Vec<&At<String>> = installation.nodes.values().map(|node| &node.mapping).collect();
+    names.sort();
+    names.dedup();
+    for name in names {
+        let own = installation.mappings.get(&name.value).cloned();
+        let source = own.or_else(|| {
+            shipped(&name.value).map(|text| SourceText::new(format!("mappings/{}.toml", name.value), text))
+        });
+        if let Some(source) = source {
+            let mut read = reader::read::<MappingFile>(&source);
+            problems.extend(read.problems.drain(..));
+            if let Some(file) = &read.content
+                && file.format.value != FORMAT
+            {
+                let message = format!("format {} is not known to this program", file.format.value);
+                problems.error(&source, &file.format.span, message, format!("it reads format {FORMAT}"));
+            }
+            files.insert(name.value.clone(), ReadMapping { source, read });
+        }
+    }
+    files
+}
+
+struct Builder<'a> {
+    installation: &'a Installation<'a>,
+    table: TagTable,
+    taken: Taken,
+    claims: Vec<Claims>,
+}
+
+impl Builder<'_> {
+    fn node(
+        &mut self,
+        problems: &mut Problems,
+        files: &BTreeMap<String, ReadMapping>,
+        name: &At<String>,
+        entry: &NodeEntry,
+    ) {
+        let config = self.installation.config;
+        problems.name(config, name, "node");
+        let bus = self.bus(problems, entry);
+        let id = problems.within(config, &entry.id, "node id", 1..=127);
+        let id = u8::try_from(id).ok().and_then(NodeId::new);
+        if let Some(bus) = bus {
+            self.taken.node_id(problems, self.installation, name, entry, bus);
+        }
+        let unit_id = self.unit_id(problems, entry);
+        if let Some(offset) = &entry.offset {
+            problems.within(config, offset, "offset", 0..=65_335);
+        }
+        let Some(mapping) = files.get(&entry.mapping.value) else {
+            let mapping = &entry.mapping;
+            let message = format!("there is no mapping `{}`", mapping.value);
+            let hint = match closest(&mapping.value, SHIPPED.iter().map(|(name, _)| *name)) {
+                Some(close) => format!("did you mean `{close}`?"),
+                None => "give the name of a file in `mappings/` without .toml, or a path to one".to_owned(),
+            };
+            problems.error(config, &mapping.span, message, hint);
+            return;
+        };
+        let (Some(file), Some(id)) = (&mapping.read.content, id) else { return };
+        let items = Items::new(problems, &mapping.source, file, &mapping.read.lost);
+        let context = Context {
+            source: &mapping.source,
+            file,
+            config,
+            entry,
+            tpdos: Tpdo::all(file),
+            items,
+            node: NodeIndex(self.table.nodes.len()),
+            base: self.table.tags.len(),
+        };
+        self.add(problems, &context, name, bus.unwrap_or_default(), id, unit_id);
+    }
+
+    fn bus(&self, problems: &mut Problems, entry: &NodeEntry) -> Option<BusIndex> {
+        let name = &entry.bus;
+        let found = self.installation.buses.keys().position(|bus| bus.value == name.value).map(BusIndex);
+        if found.is_none() {
+            let known = self.installation.buses.keys().map(|bus| bus.value.as_str());
+            problems.unknown(self.installation.config, &name.span, "bus", &name.value, known);
+        }
+        found
+    }
+
+    fn unit_id(&self, problems: &mut Problems, entry: &NodeEntry) -> u64 {
+        let config = self.installation.config;
+        let at = entry.unit_id.as_ref().unwrap_or(&entry.id);
+        if entry.unit_id.is_some() {
+            problems.within(config, at, "unit_id", 1..=247);
+        }
+        if at.value == u64::from(self.installation.gateway_unit_id) {
+            let message = format!("unit id {} is that of the gateway itself", at.value);
+            let hint = "give the node another unit_id, or the gateway another gateway_unit_id under [modbus]";
+            problems.error(config, &at.span, message, hint);
+        }
+        at.value
+    }
+
+    fn add(
+        &mut self,
+        problems: &mut Problems,
+        context: &Context<'_>,
+        name: &At<String>,
+        bus: BusIndex,
+        id: NodeId,
+        unit_id: u64,
+    ) {
+        let (tags, places) = tags::tags(problems, context);
+        fields::check_overlaps(problems, context, &fields::all(context, &tags, &places));
+        self.claims.push(addresses::of_node(problems, context, name, unit_id, &tags, &places));
+        let canopen = node::settings(problems, context, id);
+        self.taken.identifiers(problems, self.installation.config, name, bus, &canopen);
+        let base = self.table.alarms.len();
+        let alarms = alarms::of_node(problems, context, &canopen.pdos, &places, bus, base);
+        let (device, entry) = (&context.file.device, context.entry);
+        self.table.nodes.push(NodeDef {
+            name: name.value.clone(),
+            bus,
+            canopen,
+            device: DeviceDef {
+                mapping: mapping_name(&entry.mapping.value),
+                vendor: device.vendor.clone(),
+                model: device.model.clone(),
+                description: device.description.clone(),
+            },
+            unit_id: u8::try_from(unit_id).unwrap_or(1),
+            offset: entry.offset.as_ref().and_then(|offset| u16::try_from(offset.value).ok()).unwrap_or(0),
+            on_loss: entry.on_loss.into(),
+            zero_on_bad: entry.zero_on_bad,
+            tags: context.base..context.base + tags.len(),
+            alarms: base..base + alarms.len(),
+            reserved_bits: context.tpdos.iter().map(Tpdo::reserved_bits).collect(),
+            publish: publish(problems, context, &places),
+        });
+        self.table.tags.extend(tags);
+        self.table.alarms.extend(alarms);
+    }
+}
+
+/// A mapping's name without folder and ending.
+fn mapping_name(reference: &str) -> String {
+    let file = reference.rsplit('/').next().unwrap_or(reference);
+    file.strip_suffix(".toml").unwrap_or(file).to_owned()
+}
+
+fn publish(problems: &mut Problems, context: &Context<'_>, places: &[usize]) -> PublishDef {
+    let (source, section) = (context.source, &context.file.publish);
+    let mut interval = |at: &Option<At<u64>>, what: &str, lowest: u64, default: u64| {
+        problems.milliseconds(source, at.as_ref(), what, lowest..=3_600_000, Duration::from_millis(default))
+    };
+    let min_interval = interval(&section.min_interval_ms, "min_interval_ms", 10, 500);
+    let fast_interval = interval(&section.fast_interval_ms, "fast_interval_ms", 10, 100);
+    let max_interval = interval(&section.max_interval_ms, "max_interval_ms", 100, 10_000);
+    let longest = min_interval.max(fast_interval);
+    if longest > max_interval
+        && let Some(at) = section.max_interval_ms.as_ref().or(section.min_interval_ms.as_ref())
+    {
+        let message = format!(
+            "the longest interval {} ms is shorter than the shortest {} ms",
+            max_interval.as_millis(),
+            longest.as_millis()
+        );
+        problems.error(source, &at.span, message, "max_interval_ms must be the largest of the three");
+    }
+    let fast_while = section.fast_while.as_ref().and_then(|name| {
+        let tag = context.bool_tag(problems, name, &Element::default(), "`fast_while`")?;
+        places.get(tag.0).map(|place| TagIndex(context.base + place))
+    });
+    PublishDef { min_interval, fast_interval, fast_while, max_interval }
+}

@@ -1,0 +1,199 @@
+//! What the CANopen master needs to know of a node: from the mapping, changed by the installation.
+
+use std::time::Duration;
+
+use super::super::At;
+use super::super::SourceText;
+use super::super::file::{MappingFile, TpdoSection};
+use super::super::installation::ErrorControlWord;
+use super::problems::Problems;
+use super::tags::Context;
+use crate::canopen::{ErrorControl, GuardingSettings, NodeId, NodeSettings, PdoSettings, StartSettings};
+
+/// A node that has shown no frame for so long after the start is reported (R-DET-001).
+const NEVER_SEEN_AFTER: Duration = Duration::from_secs(5);
+/// Longest time that a TPDO may take, in ms.
+const LONGEST_PERIOD: u64 = 3_600_000;
+
+/// The settings of a node.
+pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> NodeSettings {
+    NodeSettings {
+        id,
+        error_control: error_control(problems, context),
+        start: start(problems, context),
+        pdos: context.tpdos.iter().map(|tpdo| pdo(problems, context, id, tpdo.key, tpdo.section)).collect(),
+        never_seen_after: NEVER_SEEN_AFTER,
+    }
+}
+
+/// A number that the installation may set instead of the mapping, with the file that it stands in.
+fn either<'a>(
+    context: &Context<'a>,
+    installation: Option<&'a At<u64>>,
+    mapping: Option<&'a At<u64>>,
+) -> Option<(&'a SourceText, &'a At<u64>)> {
+    installation.map(|at| (context.config, at)).or(mapping.map(|at| (context.source, at)))
+}
+
+fn milliseconds(
+    problems: &mut Problems,
+    number: Option<(&SourceText, &At<u64>)>,
+    what: &str,
+    limits: std::ops::RangeInclusive<u64>,
+    default: Duration,
+) -> Duration {
+    number.map_or(default, |(source, at)| problems.milliseconds(source, Some(at), what, limits, default))
+}
+
+fn error_control(problems: &mut Problems, context: &Context<'_>) -> ErrorControl {
+    let (file, entry) = (&context.file.error_control, context.entry);
+    let defaults = GuardingSettings::default();
+    let guard_time = either(context, entry.guard_time_ms.as_ref(), file.guard_time_ms.as_ref());
+    let reply = either(context, entry.guard_reply_ms.as_ref(), file.guard_reply_ms.as_ref());
+    let factor = either(context, entry.life_time_factor.as_ref(), file.life_time_factor.as_ref());
+    let heartbeat = either(context, entry.heartbeat_timeout_ms.as_ref(), file.heartbeat_timeout_ms.as_ref());
+    let timeout =
+        milliseconds(problems, heartbeat, "heartbeat_timeout_ms", 10..=65_535, Duration::from_millis(1500));
+    let life_time_factor =
+        factor.map(|(source, at)| problems.within(source, at, "life_time_factor", 1..=255));
+    let rtr_dlc = file.rtr_dlc.as_ref().map(|at| problems.within(context.source, at, "rtr_dlc", 0..=8));
+    let settle = problems.milliseconds(
+        context.source,
+        file.settle_ms.as_ref(),
+        "settle_ms",
+        0..=10_000,
+        defaults.settle,
+    );
+    let off = guard_time.is_some_and(|(_, at)| at.value == 0);
+    let guard_time = if off {
+        Duration::ZERO
+    } else {
+        milliseconds(problems, guard_time, "guard_time_ms", 20..=65_535, defaults.guard_time)
+    };
+    let mut reply_timeout =
+        milliseconds(problems, reply, "guard_reply_ms", 1..=65_535, defaults.reply_timeout);
+    if reply_timeout > guard_time && !off {
+        if let Some((source, at)) = reply {
+            let message = format!(
+                "guard_reply_ms {} is longer than guard_time_ms {}",
+                at.value,
+                guard_time.as_millis()
+            );
+            let hint = "a reply must come before the next request: use the guard time at most";
+            problems.error(source, &at.span, message, hint);
+        }
+        reply_timeout = guard_time;
+    }
+    match entry.error_control.unwrap_or(file.kind) {
+        ErrorControlWord::None => ErrorControl::None,
+        ErrorControlWord::Guarding if off => ErrorControl::None,
+        ErrorControlWord::Heartbeat => ErrorControl::Heartbeat { timeout },
+        ErrorControlWord::Guarding => ErrorControl::Guarding(GuardingSettings {
+            guard_time,
+            life_time_factor: byte(life_time_factor, defaults.life_time_factor),
+            reply_timeout,
+            toggle: entry.toggle_check.unwrap_or(file.toggle_check).into(),
+            toggle_resync: file.toggle_resync,
+            rtr_dlc: byte(rtr_dlc, defaults.rtr_dlc),
+            settle,
+        }),
+    }
+}
+
+fn byte(number: Option<u64>, default: u8) -> u8 {
+    number.and_then(|number| u8::try_from(number).ok()).unwrap_or(default)
+}
+
+fn start(problems: &mut Problems, context: &Context<'_>) -> StartSettings {
+    let (file, entry) = (&context.file.start, context.entry);
+    let defaults = StartSettings::default();
+    let delay = either(context, entry.start_delay_ms.as_ref(), file.start_delay_ms.as_ref());
+    let confirm = either(context, entry.start_confirm_ms.as_ref(), file.start_confirm_ms.as_ref());
+    let retry = either(context, entry.start_retry_ms.as_ref(), file.start_retry_ms.as_ref());
+    StartSettings {
+        auto_start: entry.auto_start.or(file.auto_start).unwrap_or(defaults.auto_start),
+        delay: milliseconds(problems, delay, "start_delay_ms", 0..=65_535, defaults.delay),
+        confirm: milliseconds(problems, confirm, "start_confirm_ms", 10..=65_535, defaults.confirm),
+        retry: milliseconds(problems, retry, "start_retry_ms", 10..=65_535, defaults.retry),
+        reset_on_recovery: entry.reset_on_recovery.unwrap_or(file.reset_on_recovery),
+    }
+}
+
+fn pdo(
+    problems: &mut Problems,
+    context: &Context<'_>,
+    id: NodeId,
+    key: &At<String>,
+    tpdo: &TpdoSection,
+) -> PdoSettings {
+    let source = context.source;
+    let number = key.value.parse::<u16>().ok().filter(|number| (1..=512).contains(number));
+    if number.is_none_or(|number| number.to_string() != key.value) {
+        let message = format!("`{}` is not the number of a TPDO", key.value);
+        problems.error(source, &key.span, message, "write [tpdo.1] to [tpdo.512]");
+    }
+    let length = problems.within(source, &tpdo.length, "length", 1..=8);
+    let millis = |problems: &mut Problems, at: &Option<At<u64>>, what: &str| {
+        at.as_ref().map(|at| Duration::from_millis(problems.within(source, at, what, 1..=LONGEST_PERIOD)))
+    };
+    let period = millis(problems, &tpdo.period_ms, "period_ms");
+    let shortest_period = millis(problems, &tpdo.shortest_period_ms, "shortest_period_ms");
+    let timeout = either(context, context.entry.pdo_timeout_ms.as_ref(), tpdo.timeout_ms.as_ref());
+    let timeout = match timeout {
+        Some((_, at)) if at.value == 0 => None,
+        None => period.map(|period| 3 * period),
+        Some((source, at)) => {
+            Some(Duration::from_millis(problems.within(source, at, "timeout", 10..=LONGEST_PERIOD)))
+        }
+    };
+    for bits in &tpdo.reserved_bits {
+        let [first, count] = bits.value;
+        if count == 0 || first.saturating_add(count) > length * 8 {
+            let message = format!(
+                "bits {first} to {} do not lie in {length} bytes",
+                first.saturating_add(count).saturating_sub(1)
+            );
+            let hint = "write [first bit, how many]; byte b bit i is bit 8 b + i";
+            problems.error(source, &bits.span, message, hint);
+        }
+    }
+    PdoSettings {
+        number: number.unwrap_or_default(),
+        cob_id: tpdo.cob_id.value.of(id),
+        length: u8::try_from(length).unwrap_or(8),
+        strict_length: context.entry.strict_dlc.unwrap_or(tpdo.strict_dlc),
+        timeout,
+        shortest_period,
+    }
+}
+
+/// One TPDO of a mapping.
+#[derive(Clone, Copy, Debug)]
+pub struct Tpdo<'a> {
+    /// Its number.
+    pub number: u64,
+    /// The number as it is written.
+    pub key: &'a At<String>,
+    /// Its entry.
+    pub section: &'a TpdoSection,
+}
+
+impl<'a> Tpdo<'a> {
+    /// All of a mapping, by their numbers.
+    pub fn all(file: &'a MappingFile) -> Vec<Self> {
+        let number = |key: &At<String>| key.value.parse().unwrap_or(u64::MAX);
+        let mut all: Vec<Self> =
+            file.tpdo.iter().map(|(key, section)| Self { number: number(key), key, section }).collect();
+        all.sort_by_key(|tpdo| tpdo.number);
+        all
+    }
+
+    /// Its reserved bits as a mask.
+    pub fn reserved_bits(&self) -> u64 {
+        let bits = self.section.reserved_bits.iter().flat_map(|bits| {
+            let [first, count] = bits.value;
+            first..first.saturating_add(count).min(64)
+        });
+        bits.filter(|bit| *bit < 64).fold(0, |mask, bit| mask | 1 << bit)
+    }
+}

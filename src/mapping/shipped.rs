@@ -1,0 +1,11 @@
+//! The mappings that come with the program.
+
+/// Name and text of each, by name.
+pub const SHIPPED: &[(&str, &str)] =
+    &[("motortech-detcon", include_str!("../../mappings/motortech-detcon.toml"))];
+
+/// The text of a shipped mapping.
+#[must_use]
+pub fn shipped(name: &str) -> Option<&'static str> {
+    SHIPPED.iter().find(|(known, _)| *known == name).map(|(_, text)| *text)
+}
