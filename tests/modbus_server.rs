@@ -1,1 +1,6 @@
-//! (none yet)
+//! The Modbus TCP server: what each request is answered with, and what happens on its sockets.
+
+mod clients;
+mod requests;
+mod streams;
+mod values;

@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use super::encoding::{Cell, encode, invalid};
+use super::encoding::Cell;
 use super::event_ring::EventField;
 use super::gateway_block::{GatewayView, bus_register};
 use super::heartbeat::Heartbeats;
 use super::node_block::NodeView;
 use super::pdu::ExceptionCode;
 use super::register_map::{BitShow, RegisterMap, RegisterShow, TagRegister, Unit};
-use crate::mapping::{Encoding, OnLoss, TagTable};
+use crate::mapping::{OnLoss, TagTable};
 use crate::process_image::{AlarmIndex, AlarmState, ProcessImage, Quality, Sample, TagIndex, Value};
 use crate::time::Now;
 
@@ -127,14 +127,13 @@ impl RegisterBank {
 
 /// The registers of a tag.
 fn tag_cell(sample: &Sample, register: &TagRegister) -> Result<Cell, ExceptionCode> {
-    let raw = matches!(register.encoding, Encoding::Raw16 | Encoding::Raw32);
-    let value = if raw { sample.raw } else { sample.value };
-    let shown = match unusable(sample.quality, register)? {
-        Some(Instead::Invalid) => return Ok(invalid(register.encoding)),
-        Some(Instead::Zero) => Value::Unsigned(0),
-        None => value,
+    let zero = (Value::Unsigned(0), Value::Unsigned(0), true);
+    let (value, raw, usable) = match unusable(sample.quality, register)? {
+        None => (sample.value, sample.raw, true),
+        Some(Instead::Invalid) => (sample.value, sample.raw, false),
+        Some(Instead::Zero) => zero,
     };
-    Ok(encode(shown, register.encoding, register.resolution))
+    Ok(Cell::of_value(register.encoding, register.resolution, value, raw, usable))
 }
 
 /// What is shown instead of a value.
