@@ -283,3 +283,103 @@ fn next_on_grid(due: Instant, period: Duration, now: Instant) -> Instant {
     let ahead = passed.saturating_add(1).saturating_mul(period);
     Instant::from_micros(due.as_micros().saturating_add(ahead))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(millis: u64) -> Instant {
+        Instant::from_millis(millis)
+    }
+
+    /// A machine whose first request was answered with toggle bit 0.
+    fn answered() -> Guarding {
+        let mut guarding = Guarding::new(GuardingSettings::default(), Duration::ZERO, at(0));
+        assert!(guarding.handle_timeout(at(0)).request);
+        assert_eq!(guarding.handle_reply(at(1), false), VALID);
+        guarding
+    }
+
+    const VALID: Verdict = Verdict::Valid { recovered: false, wrong_toggle: None };
+
+    fn error(consecutive: u16, lost: Option<bool>) -> Verdict {
+        Verdict::ToggleError(Failure { consecutive, lost })
+    }
+
+    #[test]
+    fn r_det_034_the_first_reply_may_have_either_toggle_bit() {
+        for toggle in [false, true] {
+            let mut guarding = Guarding::new(GuardingSettings::default(), Duration::ZERO, at(0));
+            guarding.handle_timeout(at(0));
+            assert_eq!(guarding.handle_reply(at(1), toggle), VALID);
+            guarding.handle_timeout(at(500));
+            assert_eq!(guarding.handle_reply(at(501), toggle), error(1, None));
+        }
+    }
+
+    #[test]
+    fn r_det_035_a_wrong_toggle_bit_does_not_change_the_expected_one() {
+        let mut guarding = answered();
+        for (request, verdict) in
+            (1..).zip([error(1, None), error(2, None), error(3, Some(true)), error(4, None)])
+        {
+            guarding.handle_timeout(at(500 * request));
+            assert_eq!(guarding.handle_reply(at(500 * request + 1), false), verdict);
+        }
+        guarding.handle_timeout(at(2500));
+        let recovered = Verdict::Valid { recovered: true, wrong_toggle: None };
+        assert_eq!(guarding.handle_reply(at(2501), true), recovered);
+    }
+
+    #[test]
+    fn misses_after_wrong_toggle_bits_are_silence_and_no_stuck_toggle() {
+        let mut guarding = answered();
+        for request in 1..=2 {
+            guarding.handle_timeout(at(500 * request));
+            guarding.handle_reply(at(500 * request + 1), false);
+        }
+        guarding.handle_timeout(at(1500));
+        let due = guarding.handle_timeout(at(1600));
+        assert_eq!(due.missed, Some(Failure { consecutive: 3, lost: Some(false) }));
+    }
+
+    #[test]
+    fn r_det_033_a_reply_at_its_deadline_is_in_time_and_requests_never_overlap() {
+        let mut guarding = answered();
+        guarding.handle_timeout(at(500));
+        assert_eq!(guarding.poll_timeout(), Some((at(600), "guard reply")));
+        assert_eq!(guarding.expire(at(600)), None);
+        assert_eq!(guarding.handle_reply(at(600), true), VALID);
+        assert_eq!(guarding.poll_timeout(), Some((at(1000), "guard request")));
+
+        let settings =
+            GuardingSettings { reply_timeout: Duration::from_secs(9), ..GuardingSettings::default() };
+        let mut slow = Guarding::new(settings, Duration::ZERO, at(0));
+        slow.handle_timeout(at(0));
+        assert_eq!(slow.poll_timeout(), Some((at(500), "guard reply")), "at most the guard time");
+        let due = slow.handle_timeout(at(500));
+        assert!(due.request && due.missed.is_some());
+    }
+
+    #[test]
+    fn requests_stay_on_their_grid_when_a_timeout_is_handled_late() {
+        let mut guarding = answered();
+        assert!(guarding.handle_timeout(at(503)).request);
+        guarding.handle_reply(at(504), true);
+        assert_eq!(guarding.poll_timeout(), Some((at(1000), "guard request")));
+        assert!(guarding.handle_timeout(at(7777)).request);
+        guarding.handle_reply(at(7778), false);
+        assert_eq!(
+            guarding.poll_timeout(),
+            Some((at(8000), "guard request")),
+            "what was slept through is let go"
+        );
+    }
+
+    #[test]
+    fn a_grid_at_the_end_of_time_does_not_overflow() {
+        let end = Instant::from_micros(u64::MAX);
+        assert_eq!(next_on_grid(end, Duration::MAX, end), end);
+        assert_eq!(next_on_grid(at(0), Duration::ZERO, at(5)), Instant::from_micros(5001));
+    }
+}

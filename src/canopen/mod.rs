@@ -37,3 +37,6 @@ pub use settings::{
     ErrorControl, GuardingSettings, NetworkSettings, NodeSettings, PdoIndex, PdoSettings, Role,
     StartSettings, TogglePolicy,
 };
+
+#[cfg(test)]
+mod tests;

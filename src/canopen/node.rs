@@ -151,7 +151,7 @@ impl Node {
         let waiting = matches!(self.state, Some(NmtState::Stopped | NmtState::PreOperational));
         self.note_sent(now, NmtRequest::Start, outputs);
         if let Some(start) = self.start.as_mut().filter(|_| waiting && !self.watch.is_lost()) {
-            start.sent(now);
+            start.sent_to_all(now);
         }
     }
 

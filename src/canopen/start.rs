@@ -80,6 +80,15 @@ impl Start {
         self.phase = Phase::Sent(now + wait);
     }
 
+    /// A start command to all nodes was sent because of another node. It counts as this one's too, unless one was sent
+    /// so lately that its effect is still to be awaited.
+    pub(super) fn sent_to_all(&mut self, now: Instant) {
+        let lately = matches!(self.phase, Phase::Sent(at) if at.since(now) > self.settings.retry / 2);
+        if !lately {
+            self.sent(now);
+        }
+    }
+
     /// A start command did not leave: it does not count.
     pub(super) fn handle_not_sent(&mut self) {
         self.attempts = self.attempts.saturating_sub(1);

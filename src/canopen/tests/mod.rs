@@ -1,0 +1,13 @@
+//! Tests of the network as a whole.
+//!
+//! - `bench`: frames in candump notation in, lines of text out.
+//! - `worked_examples`: guarding and boot-up, step by step.
+//! - `duties`: starting, orders, TPDOs, heartbeat.
+//! - `surroundings`: other masters, strangers, duplicate ids, the passive role, a bus that fails.
+//! - `properties`: random input; a day of quiet guarding.
+
+mod bench;
+mod duties;
+mod properties;
+mod surroundings;
+mod worked_examples;

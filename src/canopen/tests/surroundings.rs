@@ -1,0 +1,228 @@
+//! What comes from outside: other masters, strangers, two nodes with one id, a bus that fails; and the passive role.
+
+use super::bench::{Bench, detcon, master, mute, passive, running, running_with};
+use crate::canopen::{ErrorControl, GuardingSettings, NmtRequest, NodeId, NodeSettings};
+use crate::time::Now;
+
+#[test]
+fn foreign_nmt_commands_are_told_and_believed_only_after_the_node_says_so() {
+    let mut bench = running_with(mute());
+    bench.frame(100, "000#0201").run(500).frame(501, "701#84");
+    assert_eq!(
+        bench.take(),
+        [
+            "100 NmtCommand { command: 2, node: 1 }",
+            "500 701#R1",
+            "501 State { from: Some(Operational), to: Stopped, ordered: false }",
+            "501 000#0101",
+            "501 NmtSent { request: Start }",
+        ]
+    );
+    bench.frames(&[(600, "000#01"), (610, "000#R2"), (620, "000#FF00")]);
+    assert_eq!(
+        bench.take(),
+        [
+            "600 UnknownId { id: 000, node: None, first: true }",
+            "610 UnknownId { id: 000, node: None, first: false }",
+            "620 NmtCommand { command: 255, node: 0 }",
+        ]
+    );
+}
+
+#[test]
+fn unknown_identifiers_are_new_once_and_the_memory_for_them_is_bounded() {
+    let mut bench = running_with(mute());
+    for round in 0..2 {
+        for id in 0..400 {
+            bench.frame(1, &format!("{:08X}#00", 0x10_0000 + id));
+        }
+        let first = bench.take_those_with("first: true").len();
+        assert_eq!(first, if round == 0 { 256 } else { 0 });
+    }
+    bench.frames(&[(2, "080#"), (3, "080#"), (4, "17F#"), (5, "682#"), (6, "7E5#00")]);
+    assert_eq!(
+        bench.take(),
+        [
+            "2 UnknownId { id: 080, node: None, first: true }",
+            "3 UnknownId { id: 080, node: None, first: false }",
+            "4 UnknownId { id: 17F, node: None, first: true }",
+            "5 UnknownId { id: 682, node: None, first: true }",
+            "6 UnknownId { id: 7E5, node: None, first: true }",
+        ]
+    );
+}
+
+#[test]
+fn a_tpdo_may_have_a_29_bit_identifier() {
+    let mut settings = detcon(1);
+    settings.pdos[0].cob_id = "18FF0001#".parse::<crate::can::CanFrame>().unwrap().id();
+    let mut bench = running_with(settings);
+    bench.frame(100, "18FF0001#0102030405060708").frame(110, "181#0102030405060708");
+    assert_eq!(
+        bench.take(),
+        [
+            "100 Pdo { pdo: PdoIndex(0), data: [1, 2, 3, 4, 5, 6, 7, 8], length: 8 }",
+            "110 UnknownId { id: 181, node: Some(node 1), first: true }",
+        ]
+    );
+}
+
+#[test]
+fn r_det_004_of_two_nodes_with_one_id_the_first_counts() {
+    let second = NodeSettings { error_control: ErrorControl::None, ..detcon(1) };
+    let mut bench =
+        Bench::new(master(vec![mute(), second, NodeSettings { id: NodeId::new(2).unwrap(), ..mute() }]));
+    bench.run(20);
+    assert_eq!(bench.take(), ["0 701#R1", "10 702#R1"]);
+}
+
+#[test]
+fn a_request_that_did_not_leave_is_no_miss() {
+    let mut bench = running_with(mute());
+    for request in 1..=10 {
+        bench.not_sent(500 * request, "701#R1");
+    }
+    bench.run(5499);
+    assert!(bench.take().iter().all(|line| line.ends_with("701#R1")));
+}
+
+#[test]
+fn a_bus_that_is_down_blames_no_node_and_is_asked_anew_when_it_comes_back() {
+    let mut bench = running();
+    bench.link(400, false).run(60_000);
+    assert!(!bench.request(60_000, 1, NmtRequest::Start), "nothing can be sent");
+    assert!(bench.take().is_empty());
+    bench.link(60_000, true).frame(60_001, "701#05").link(60_002, true).run(60_499);
+    assert_eq!(bench.take(), ["60000 701#R1"], "either toggle bit");
+}
+
+#[test]
+fn a_loss_outlives_a_bus_failure_until_the_node_answers() {
+    let mut bench = running_with(mute());
+    bench.run(1600).link(1700, false).link(1800, true).run(10_000);
+    assert_eq!(bench.take_those_with("Lost").len(), 1);
+    bench.frame(10_301, "701#05");
+    assert_eq!(bench.take_those_with("Recovered"), ["10301 Recovered"]);
+}
+
+#[test]
+fn a_node_is_not_called_never_seen_while_the_bus_is_down() {
+    let mut bench = Bench::new(master(vec![mute()]));
+    bench.link(1000, false).link(60_000, true).run(69_999);
+    assert!(bench.take_those_with("NeverSeen").is_empty());
+    bench.run(70_000);
+    assert_eq!(bench.take_those_with("NeverSeen"), ["70000 NeverSeen"]);
+}
+
+#[test]
+fn passive_states_are_taken_from_what_another_master_asks() {
+    let mut bench = Bench::new(passive(vec![detcon(1)]));
+    bench.frames(&[
+        (100, "701#00"),
+        (200, "701#R1"),
+        (201, "701#7F"),
+        (202, "000#0101"),
+        (203, "181#0000000000000000"),
+        (700, "701#R1"),
+        (701, "701#05"),
+        (1200, "701#R1"),
+        (1201, "701#05"),
+        (1300, "000#0200"),
+        (1301, "701#84"),
+    ]);
+    bench.run(60_000);
+    assert_eq!(
+        bench.take(),
+        [
+            "100 Seen",
+            "100 State { from: None, to: Initialising, ordered: true }",
+            "201 State { from: Some(Initialising), to: PreOperational, ordered: true }",
+            "202 NmtCommand { command: 1, node: 1 }",
+            "203 State { from: Some(PreOperational), to: Operational, ordered: true }",
+            "203 Pdo { pdo: PdoIndex(0), data: [0, 0, 0, 0, 0, 0, 0, 0], length: 8 }",
+            "1300 NmtCommand { command: 2, node: 0 }",
+            "1300 State { from: Some(Operational), to: Stopped, ordered: true }",
+            "2901 Lost { stuck_toggle: false }",
+        ]
+    );
+}
+
+#[test]
+fn passive_without_foreign_guarding_only_tpdos_can_time_out() {
+    let mut bench = Bench::new(passive(vec![detcon(1)]));
+    bench.frame(100, "701#00").frame(300, "181#0000000000000000").run(60_000);
+    let told = bench.take();
+    assert!(told.iter().all(|line| !line.contains("Lost")), "{told:?}");
+    assert_eq!(told.iter().filter(|line| line.contains("PdoTimeout")).count(), 4);
+}
+
+#[test]
+fn resync_bears_with_a_second_guarding_master_and_strict_does_not() {
+    for (toggle_resync, errors) in [(false, 20), (true, 0)] {
+        let guarding = GuardingSettings { toggle_resync, ..GuardingSettings::default() };
+        let mut bench =
+            running_with(NodeSettings { error_control: ErrorControl::Guarding(guarding), ..mute() });
+        for request in 1..=20 {
+            bench.frame(500 * request - 250, "701#R1").frame(500 * request - 249, "701#85");
+            bench.run(500 * request).frame(500 * request + 1, "701#05");
+        }
+        let told = bench.take();
+        let wrong = told.iter().filter(|line| line.contains("ToggleError")).count();
+        assert_eq!(wrong, errors, "resync {toggle_resync}: {told:?}");
+        assert!(
+            told.iter().all(|line| !line.contains("Unsolicited") && !line.contains("Duplicate")),
+            "{told:?}"
+        );
+    }
+}
+
+#[test]
+fn a_node_id_that_answers_each_request_twice_is_suspected_and_cleared() {
+    let mut bench = running_with(mute());
+    for request in 1..=4 {
+        let byte = if request % 2 == 1 { "85" } else { "05" };
+        bench.run(500 * request).frame(500 * request + 1, &format!("701#{byte}"));
+        bench.frame(500 * request + 2, &format!("701#{byte}"));
+    }
+    assert_eq!(
+        bench.take_those_with("Duplicate"),
+        ["1502 DuplicateSuspected { evidence: \"guard requests are answered twice\" }"]
+    );
+    for request in 5..=70 {
+        let byte = if request % 2 == 1 { "85" } else { "05" };
+        bench.run(500 * request).frame(500 * request + 1, &format!("701#{byte}"));
+    }
+    assert_eq!(bench.take_those_with("Duplicate"), ["32002 DuplicateCleared"]);
+}
+
+#[test]
+fn a_boot_up_while_tpdos_go_on_is_a_second_node() {
+    let mut bench = running();
+    bench.frames(&[(400, "181#0000000000000000"), (450, "701#00"), (460, "281#0000000000000000")]);
+    assert_eq!(
+        bench.take_those_with("Duplicate"),
+        ["460 DuplicateSuspected { evidence: \"a boot-up message while TPDOs go on\" }"]
+    );
+}
+
+#[test]
+fn a_gateway_that_was_asleep_counts_one_miss_and_sends_one_request() {
+    let mut bench = running_with(mute());
+    bench.run(500).take();
+    bench.network.handle_timeout(Now::from_millis(60_250));
+    let told: Vec<_> = std::iter::from_fn(|| bench.network.poll_output()).collect();
+    assert_eq!(told.len(), 2, "{told:?}");
+    assert_eq!(bench.network.poll_timeout().unwrap().0.as_millis(), 60_350, "then the reply");
+}
+
+#[test]
+fn a_reply_received_in_time_but_handed_over_late_is_valid() {
+    let mut bench = running_with(mute());
+    bench.run(600).take();
+    bench.network.handle_frame(Now::from_millis(501), &"701#85".parse().unwrap());
+    assert_eq!(
+        bench.network.poll_output().map(|output| format!("{output:?}")).unwrap(),
+        "Node(node 1, FrameSeen)"
+    );
+    assert_eq!(bench.network.poll_output(), None, "not unsolicited");
+}
