@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::bench::{Bench, detcon, master, mute, passive, running, running_with};
 use crate::canopen::{
     ErrorControl, GuardingSettings, Network, NetworkOutput, NetworkSettings, NmtRequest, NodeId,
-    NodeSettings, Role, StartSettings,
+    NodeSettings, StartSettings,
 };
 use crate::time::Now;
 
