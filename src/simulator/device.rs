@@ -68,6 +68,11 @@ impl SimulatedDevice {
 
     /// Takes an order.
     pub fn handle_control(&mut self, now: Now, control: Control) {
+        self.obey(now, control);
+        self.show(now);
+    }
+
+    fn obey(&mut self, now: Now, control: Control) {
         match control {
             Control::Power(true) => self.detcon.power_on(now),
             Control::Power(false) => self.detcon.power_off(now),
@@ -98,7 +103,6 @@ impl SimulatedDevice {
                 self.detcon.update_faults(now, |faults| switch_fault(faults, control));
             }
         }
-        self.show(now);
     }
 
     /// Takes a frame that another participant sent.
@@ -107,13 +111,18 @@ impl SimulatedDevice {
         self.detcon.handle_frame(now, frame);
     }
 
-    /// What became due.
+    /// What became due. What happens at one moment is shown at once, in one frame.
     pub fn handle_timeout(&mut self, now: Now) {
+        let mut changed = false;
         while let Some(control) = self.player.poll(now.instant) {
-            self.handle_control(now, control);
+            self.obey(now, control);
+            changed = true;
         }
         if self.engine.poll_timeout() <= now.instant {
             self.engine.handle_timeout(now.instant);
+            changed = true;
+        }
+        if changed {
             self.show(now);
         }
         self.detcon.handle_timeout(now);
