@@ -1,1 +1,3 @@
 //! The command line: one file for each subcommand, thin.
+
+pub mod sim;

@@ -14,6 +14,27 @@ use crate::can::CanFrame;
 use crate::canopen::{NmtState, NodeId};
 use crate::time::{Instant, Now};
 
+/// A device that is to be simulated.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DevicePlan {
+    /// Its node id.
+    pub node: NodeId,
+    /// What it is like and what happens to it.
+    pub scenario: Scenario,
+    /// Equal seeds behave alike.
+    pub seed: u64,
+    /// The story begins so long after power-on.
+    pub story_after: Duration,
+}
+
+impl DevicePlan {
+    /// A device whose story begins at once.
+    #[must_use]
+    pub fn new(node: NodeId, scenario: Scenario) -> Self {
+        Self { node, scenario, seed: u64::from(node.get()), story_after: Duration::ZERO }
+    }
+}
+
 /// A device with its engine and its story.
 #[derive(Clone, Debug)]
 pub struct SimulatedDevice {
@@ -35,13 +56,13 @@ pub struct Status {
 }
 
 impl SimulatedDevice {
-    /// Powers a device on at `now`. Equal seeds behave alike; the story begins `story_after` later.
+    /// Powers a device on at `now`.
     #[must_use]
-    pub fn power_on(node: NodeId, scenario: &Scenario, seed: u64, story_after: Duration, now: Now) -> Self {
+    pub fn power_on(plan: &DevicePlan, now: Now) -> Self {
         let mut device = Self {
-            detcon: Detcon::new(node, scenario.settings.clone()),
-            engine: Engine::new(scenario.cylinders, seed, now.instant),
-            player: Player::new(scenario, now.instant + story_after),
+            detcon: Detcon::new(plan.node, plan.scenario.settings.clone()),
+            engine: Engine::new(plan.scenario.cylinders, plan.seed, now.instant),
+            player: Player::new(&plan.scenario, now.instant + plan.story_after),
             overrides: BTreeMap::new(),
         };
         device.detcon.power_on(now);

@@ -29,7 +29,7 @@ pub mod values;
 
 pub use control::{Control, Order, Point};
 pub use detcon::{Detcon, DetconSettings};
-pub use device::{SimulatedDevice, Status};
+pub use device::{DevicePlan, SimulatedDevice, Status};
 pub use error::{Problem, SimulatorError};
 pub use faults::Faults;
 pub use scenario::Scenario;
@@ -38,19 +38,17 @@ pub use values::{Channel, StatusBit, Tpdo, Values, WireFormat};
 use std::time::Duration;
 
 use crate::canopen::NodeId;
-use crate::time::Now;
 
-/// The devices of `cangate demo`, powered on at `now`: node 1 at an engine of 16 cylinders, node 2 at one of 12. Both
-/// tell the same story, the second half a minute later, so that something goes on most of the time.
+/// The devices of `cangate demo`: node 1 at an engine of 16 cylinders, node 2 at one of 12. Both tell the same story, the
+/// second half a minute later, so that something goes on most of the time.
 #[must_use]
-pub fn demo(now: Now) -> Vec<SimulatedDevice> {
+pub fn demo() -> Vec<DevicePlan> {
     let Some(scenario) = Scenario::shipped("demo") else { return Vec::new() };
     [(1, 16, Duration::ZERO), (2, 12, Duration::from_secs(30))]
         .into_iter()
         .filter_map(|(node, cylinders, story_after)| {
             let scenario = Scenario { cylinders, ..scenario.clone() };
-            let node = NodeId::new(node)?;
-            Some(SimulatedDevice::power_on(node, &scenario, u64::from(node.get()), story_after, now))
+            Some(DevicePlan { story_after, ..DevicePlan::new(NodeId::new(node)?, scenario) })
         })
         .collect()
 }

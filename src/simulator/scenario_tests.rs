@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::canopen::{NmtState, NodeId};
-use crate::simulator::device::SimulatedDevice;
+use crate::simulator::{DevicePlan, SimulatedDevice};
 use crate::time::Now;
 
 /// Runs a shipped scenario with a master that starts the device whenever it is not operational, asked every 500 ms.
@@ -10,7 +10,7 @@ use crate::time::Now;
 fn play(name: &str, until: u64) -> Vec<(u64, String)> {
     let scenario = Scenario::shipped(name).unwrap();
     let node = NodeId::new(1).unwrap();
-    let mut device = SimulatedDevice::power_on(node, &scenario, 1, Duration::ZERO, Now::from_millis(0));
+    let mut device = SimulatedDevice::power_on(&DevicePlan::new(node, scenario), Now::from_millis(0));
     let mut log = Vec::new();
     for millis in 0..=until {
         let now = Now::from_millis(millis);
@@ -169,7 +169,8 @@ fn demo_knocks_on_cylinder_7_by_second_8_then_loses_a_sensor_and_trips_within_mi
 
 #[test]
 fn the_two_devices_of_the_demo_take_turns() {
-    let mut devices = crate::simulator::demo(Now::from_millis(0));
+    let power_on = |plan| SimulatedDevice::power_on(plan, Now::from_millis(0));
+    let mut devices: Vec<_> = crate::simulator::demo().iter().map(power_on).collect();
     assert_eq!(devices.iter().map(|device| device.node().get()).collect::<Vec<_>>(), [1, 2]);
     let mut first_knock = [None; 2];
     for millis in (0..60_000).step_by(50) {

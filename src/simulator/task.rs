@@ -7,7 +7,7 @@ use tokio::time::sleep_until;
 use tokio_util::sync::CancellationToken;
 
 use super::control::{HELP, Order};
-use super::device::{SimulatedDevice, Status};
+use super::device::{DevicePlan, SimulatedDevice, Status};
 use crate::can::{BusEvent, BusIndex, CanFrame};
 use crate::time::{Clock, Instant, Now};
 
@@ -20,26 +20,21 @@ pub struct BusEnd {
     pub transmit: mpsc::Sender<CanFrame>,
 }
 
-/// Runs devices until `stop`, or until the bus task has ended.
+/// Runs devices until `stop`, or until the bus task has ended. They are powered on when the bus is up for the first time.
 ///
 /// `lines` takes control lines ([`Order`], or `help`); its end does not end the simulation. `report` gets one line for
 /// each change of a device's [`Status`], each order and each change of the bus; when it cannot be written to, the
 /// simulation goes on without it.
 pub async fn run(
-    devices: Vec<SimulatedDevice>,
+    plans: Vec<DevicePlan>,
     mut bus: BusEnd,
     mut lines: mpsc::Receiver<String>,
     report: impl Write + Send,
     clock: Clock,
     stop: CancellationToken,
 ) {
-    let mut bench = Bench {
-        devices: devices.into_iter().map(|device| (device, None)).collect(),
-        transmit: bus.transmit,
-        queue_full: false,
-        bus_up: None,
-        report,
-    };
+    let mut bench =
+        Bench { plans, devices: Vec::new(), transmit: bus.transmit, queue_full: false, bus_up: None, report };
     let mut lines_open = true;
     loop {
         let now = clock.now();
@@ -51,7 +46,7 @@ pub async fn run(
                 Some((_, event)) => bench.handle_event(clock.now(), &event),
                 None => return,
             },
-            line = lines.recv(), if lines_open => match line {
+            line = lines.recv(), if lines_open && bench.plans.is_empty() => match line {
                 Some(line) => bench.handle_line(clock.now(), line.trim()),
                 None => lines_open = false,
             },
@@ -63,8 +58,10 @@ pub async fn run(
     }
 }
 
-/// The devices, each with the status that was reported last.
 struct Bench<W> {
+    /// Devices that wait for the bus.
+    plans: Vec<DevicePlan>,
+    /// Each with the status that was reported last.
     devices: Vec<(SimulatedDevice, Option<Status>)>,
     transmit: mpsc::Sender<CanFrame>,
     queue_full: bool,
@@ -89,6 +86,11 @@ impl<W: Write> Bench<W> {
             BusEvent::Link { link, .. } => {
                 if self.bus_up.replace(link.is_up()) != Some(link.is_up()) {
                     self.say(now, if link.is_up() { "bus: up" } else { "bus: down" });
+                }
+                if link.is_up() {
+                    let plans = std::mem::take(&mut self.plans);
+                    let devices = plans.iter().map(|plan| (SimulatedDevice::power_on(plan, now), None));
+                    self.devices.extend(devices);
                 }
             }
             BusEvent::NotSent { .. } | BusEvent::Counters { .. } => {}
@@ -188,20 +190,28 @@ mod tests {
     }
 
     impl Rig {
-        fn start(count: u8, queue: usize) -> Self {
+        /// On a bus that is up.
+        async fn start(count: u8, queue: usize) -> Self {
+            let rig = Self::waiting(count, queue);
+            rig.link(Link::ErrorActive).await;
+            rig
+        }
+
+        async fn link(&self, link: Link) {
+            let event = BusEvent::Link { link, at: self.clock.now() };
+            self.events.send((BusIndex(0), event)).await.unwrap();
+        }
+
+        fn waiting(count: u8, queue: usize) -> Self {
             let (events, events_end) = mpsc::channel(16);
             let (transmit, sent) = mpsc::channel(queue);
             let (lines, lines_end) = mpsc::channel(16);
             let (clock, stop, paper) = (Clock::start(), CancellationToken::new(), Paper::default());
-            let scenario = Scenario::shipped("quiet").unwrap();
-            let devices = (1..=count)
-                .map(|node| {
-                    let node = NodeId::new(node).unwrap();
-                    SimulatedDevice::power_on(node, &scenario, 1, Duration::ZERO, clock.now())
-                })
-                .collect();
+            let plan =
+                |node| DevicePlan::new(NodeId::new(node).unwrap(), Scenario::shipped("quiet").unwrap());
+            let plans = (1..=count).map(plan).collect();
             let end = BusEnd { events: events_end, transmit };
-            let task = tokio::spawn(run(devices, end, lines_end, paper.clone(), clock, stop.clone()));
+            let task = tokio::spawn(run(plans, end, lines_end, paper.clone(), clock, stop.clone()));
             Self { events, sent, lines, paper, clock, stop, task }
         }
 
@@ -229,7 +239,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn devices_boot_start_and_report() {
-        let mut rig = Rig::start(2, 64);
+        let mut rig = Rig::start(2, 64).await;
         pass(200).await;
         rig.frame("000#0102").await;
         pass(60).await;
@@ -247,7 +257,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn control_lines_switch_one_or_all_devices_and_are_answered() {
-        let mut rig = Rig::start(2, 64);
+        let mut rig = Rig::start(2, 64).await;
         rig.frame("000#0100").await;
         for line in ["node 2 power off", "knock 7 on", "node 9 trip", "nonsense", "", "help"] {
             rig.line(line).await;
@@ -274,7 +284,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn the_simulation_outlives_its_control_lines_and_ends_with_the_bus() {
-        let mut rig = Rig::start(1, 64);
+        let mut rig = Rig::start(1, 64).await;
         let (lines, _) = mpsc::channel(1);
         rig.lines = lines;
         pass(100).await;
@@ -288,7 +298,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn a_full_queue_loses_frames_and_says_so_once() {
-        let mut rig = Rig::start(4, 2);
+        let mut rig = Rig::start(4, 2).await;
         pass(1).await;
         assert_eq!(rig.frames(), ["701#00", "702#00"]);
         assert_eq!(rig.report().matches("overloaded").count(), 1);
@@ -296,13 +306,29 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn the_state_of_the_bus_is_reported_when_it_changes() {
-        let rig = Rig::start(1, 64);
-        for link in [Link::ErrorActive, Link::ErrorPassive, Link::Down, Link::Absent] {
-            let event = BusEvent::Link { link, at: rig.clock.now() };
-            rig.events.send((BusIndex(0), event)).await.unwrap();
+        let rig = Rig::start(1, 64).await;
+        for link in [Link::ErrorPassive, Link::Down, Link::Absent] {
+            rig.link(link).await;
         }
         pass(1).await;
         let report = rig.report();
         assert_eq!((report.matches("bus: up").count(), report.matches("bus: down").count()), (1, 1));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn devices_are_powered_on_when_the_bus_is_up_and_not_again() {
+        let mut rig = Rig::waiting(1, 64);
+        rig.link(Link::Absent).await;
+        rig.line("knock 7 on").await;
+        pass(5000).await;
+        assert!(rig.frames().is_empty());
+        rig.link(Link::ErrorActive).await;
+        pass(10).await;
+        assert_eq!(rig.frames(), ["701#00"]);
+        assert!(rig.report().contains("5.000 ok: knock 7 on"));
+        rig.link(Link::Down).await;
+        rig.link(Link::ErrorActive).await;
+        pass(10).await;
+        assert!(rig.frames().is_empty());
     }
 }
