@@ -9,6 +9,7 @@
 //! - `tags`: the value of every tag; `derived`: computed tags.
 //! - `conditions`: what raises alarms. `events`: on the way to the journal.
 //! - `marks`: which places changed.
+//! - [`task`] \[IO\]: owns the gateway and the image's writer.
 
 mod bus;
 pub mod command;
@@ -23,6 +24,7 @@ mod node;
 mod node_event;
 mod operate;
 mod tags;
+pub mod task;
 
 pub use command::{Action, Command, CommandSource, Outcome};
 pub use core::{Gateway, Health, Input, Output};
