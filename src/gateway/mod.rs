@@ -9,6 +9,7 @@
 //! - `tags`: the value of every tag; `derived`: computed tags.
 //! - `conditions`: what raises alarms. `events`: on the way to the journal.
 //! - `marks`: which places changed.
+//! - [`replay`]: a recording through the same core.
 //! - [`task`] \[IO\]: owns the gateway and the image's writer.
 
 mod bus;
@@ -23,6 +24,7 @@ mod marks;
 mod node;
 mod node_event;
 mod operate;
+pub mod replay;
 mod tags;
 pub mod task;
 

@@ -1,4 +1,5 @@
 //! What several tests need.
+pub mod conversation;
 pub mod fake_broker;
 pub mod modbus;
 pub mod plant;
