@@ -1,6 +1,7 @@
 //! Opens any kind of interface. \[IO\]
 
 use super::interface::Interface;
+use super::slcan_port::{self, SlcanReader, SlcanWriter};
 use super::socketcan::{self, SocketReader, SocketWriter};
 use super::virtual_bus::{self, VirtualReader, VirtualWriter};
 use super::{BusError, BusEvent, BusReader, BusWriter, CanBus, CanFrame, Tally};
@@ -18,6 +19,8 @@ pub struct AnyBus {
 pub enum AnyReader {
     /// An interface of the host.
     SocketCan(SocketReader),
+    /// A LAWICEL adapter.
+    Slcan(SlcanReader),
     /// A bus inside the process.
     Virtual(VirtualReader),
 }
@@ -27,6 +30,8 @@ pub enum AnyReader {
 pub enum AnyWriter {
     /// An interface of the host.
     SocketCan(SocketWriter),
+    /// A LAWICEL adapter.
+    Slcan(SlcanWriter),
     /// A bus inside the process.
     Virtual(VirtualWriter),
 }
@@ -47,10 +52,10 @@ pub fn open(interface: &Interface, clock: Clock) -> Result<AnyBus, BusError> {
             let (reader, writer) = virtual_bus::join(name, clock).split();
             Ok(AnyBus { reader: AnyReader::Virtual(reader), writer: AnyWriter::Virtual(writer) })
         }
-        Interface::Slcan { .. } | Interface::SlcanTcp { .. } => Err(BusError::Io {
-            interface: interface.to_string(),
-            source: std::io::Error::from(std::io::ErrorKind::Unsupported),
-        }),
+        Interface::Slcan { .. } | Interface::SlcanTcp { .. } => {
+            let (reader, writer) = slcan_port::open(interface, clock);
+            Ok(AnyBus { reader: AnyReader::Slcan(reader), writer: AnyWriter::Slcan(writer) })
+        }
     }
 }
 
@@ -85,6 +90,7 @@ impl BusReader for AnyReader {
     async fn recv(&mut self) -> Result<BusEvent, BusError> {
         match self {
             Self::SocketCan(reader) => reader.recv().await,
+            Self::Slcan(reader) => reader.recv().await,
             Self::Virtual(reader) => reader.recv().await,
         }
     }
@@ -92,6 +98,7 @@ impl BusReader for AnyReader {
     fn tally(&self) -> Tally {
         match self {
             Self::SocketCan(reader) => reader.tally(),
+            Self::Slcan(reader) => reader.tally(),
             Self::Virtual(reader) => reader.tally(),
         }
     }
@@ -101,6 +108,7 @@ impl BusWriter for AnyWriter {
     async fn send(&mut self, frame: &CanFrame) -> Result<(), BusError> {
         match self {
             Self::SocketCan(writer) => writer.send(frame).await,
+            Self::Slcan(writer) => writer.send(frame).await,
             Self::Virtual(writer) => writer.send(frame).await,
         }
     }

@@ -154,6 +154,10 @@ impl FromStr for CanFrame {
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let fail = |reason| ParseFrameError { text: text.to_owned(), reason };
         let (id, payload) = text.split_once('#').ok_or_else(|| fail("there is no `#`"))?;
+        // `from_str_radix` takes a sign.
+        if text.contains('+') {
+            return Err(fail("a number has no sign"));
+        }
         let number = u32::from_str_radix(id, 16).map_err(|_| fail("the identifier is not hexadecimal"))?;
         let id = match id.len() {
             3 => u16::try_from(number).ok().and_then(CanId::standard),
@@ -200,6 +204,9 @@ mod tests {
             ("181#GG", "pairs"),
             ("181#000000000000000000", "at most 8"),
             ("701#R9", "0 to 8"),
+            ("701#R+1", "no sign"),
+            ("+81#00", "no sign"),
+            ("181#+1", "no sign"),
             ("181#é", "pairs"),
         ] {
             let error = text.parse::<CanFrame>().unwrap_err().to_string();

@@ -8,8 +8,10 @@
 //! - [`bus`] \[IO\]: [`open`] any interface.
 //! - [`socketcan`] \[IO\]: interfaces of the host, with [`host_link`] \[IO\] (what the host says of them) and, pure,
 //!   [`raw_frame`] (what a socket gives), [`controller`] (the state of the link), [`stamp`] (receive times).
+//! - [`slcan_port`] \[IO\]: LAWICEL adapters on serial ports and TCP; [`slcan`], pure, is their language.
 //! - [`virtual_bus`] \[IO\]: buses inside the process.
 //! - [`task`] \[IO\]: owns one bus, opens it again whenever it was lost, counts; [`outage`] keeps its log short.
+//! - [`recording`]: candump logs, pure.
 
 pub mod bus;
 pub mod controller;
@@ -18,6 +20,9 @@ pub mod host_link;
 pub mod interface;
 pub mod outage;
 pub mod raw_frame;
+pub mod recording;
+pub mod slcan;
+pub mod slcan_port;
 pub mod socketcan;
 pub mod stamp;
 pub mod task;
