@@ -49,7 +49,9 @@ pub async fn run(
     stop: CancellationToken,
     status: watch::Sender<MqttStatus>,
 ) {
-    run_at_pace(settings, gateway, publisher, reader, clock, stop, status, Pace::default()).await;
+    let longest = Duration::from_secs(settings.reconnect_max_s.into());
+    let pace = Pace { longest, ..Pace::default() };
+    run_at_pace(settings, gateway, publisher, reader, clock, stop, status, pace).await;
 }
 
 /// The same with other waits between the attempts.

@@ -11,7 +11,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 /// First wait after a lost or refused session; doubled at each further failure, with full jitter.
 pub const BACK_OFF_FIRST: Duration = Duration::from_secs(1);
-/// Longest wait between two attempts.
+/// Longest wait between two attempts, unless `reconnect_max_s` says otherwise.
 pub const BACK_OFF_LONGEST: Duration = Duration::from_secs(60);
 /// A session must last this long before the waits start again from [`BACK_OFF_FIRST`].
 pub const HEALTHY_AFTER: Duration = Duration::from_secs(60);
@@ -43,6 +43,10 @@ pub struct MqttSettings {
     #[serde(deserialize_with = "keep_alive")]
     #[schemars(range(min = 5, max = 3600))]
     pub keep_alive_s: u16,
+    /// Longest wait in seconds between two attempts to reach the broker, 1..=3600. The waits double from 1 s up to it.
+    #[serde(deserialize_with = "reconnect_max")]
+    #[schemars(range(min = 1, max = 3600))]
+    pub reconnect_max_s: u16,
     /// Quality of service of `<node>/state` and `bridge/health`: 0 or 1. Everything else is always sent with 1.
     #[schemars(with = "u8", range(min = 0, max = 1))]
     pub qos_state: StateQos,
@@ -69,6 +73,7 @@ impl Default for MqttSettings {
             username: None,
             password_file: None,
             keep_alive_s: 20,
+            reconnect_max_s: 60,
             qos_state: StateQos::AtLeastOnce,
             inflight: 16,
             outbox_messages: 20_000,
@@ -277,6 +282,10 @@ fn keep_alive<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u16, D::Erro
     within(deserializer, 5..=3600)
 }
 
+fn reconnect_max<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u16, D::Error> {
+    within(deserializer, 1..=3600)
+}
+
 fn inflight<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u16, D::Error> {
     within(deserializer, 1..=1000)
 }
@@ -347,6 +356,7 @@ mod tests {
     fn what_cannot_work_is_refused_with_a_reason() {
         for (text, reason) in [
             ("keep_alive_s = 0", "0 is outside 5..=3600"),
+            ("reconnect_max_s = 0", "0 is outside 1..=3600"),
             ("inflight = 0", "0 is outside 1..=1000"),
             ("qos_state = 2", "quality of service 2 is not offered; use 0 or 1"),
             ("outbox_messages = 1", "1 is outside 100..=1000000"),
