@@ -310,7 +310,8 @@ fn v_det_11_12_r_det_052_064_to_067_channels_17_to_20_and_reserved_bits() {
     check_intensities(&bench, "V-DET-11");
     for (example, frame) in [("V-DET-11", "481#0019FF800301"), ("V-DET-12", "481#0019FF80F3F1")] {
         cansend("481#000000000000");
-        bench.expect_registers(example, USED + 1, &[0, 0, 0]);
+        bench.expect_registers(example, USED + 1, &[0]);
+        bench.expect_registers(example, BAD + 1, &[0]);
         cansend(frame);
         bench.expect_registers(example, INTENSITY + 16, &[0, 980, 10000, 5020]);
         bench.expect_registers(example, USED + 1, &[3]);
