@@ -4,11 +4,20 @@
 //! mapping's expressions and the gateway's built-in conditions decide that), texts, topics.
 //!
 //! - [`spec`]: what each alarm is like.
-//! - `state`: the state machine of one alarm.
-//! - `list`: all alarms; suppression and first-out.
+//! - [`state`]: the state machine of one alarm.
+//! - `suppression`: which alarm tells the cause of which.
+//! - [`list`]: all alarms; delays, shelving, suppression, first-out.
 
 pub mod list;
 pub mod spec;
+pub mod state;
+mod suppression;
 
-pub use list::{AcknowledgeError, AlarmList, Transition};
+pub use list::{AcknowledgeError, AlarmCounts, AlarmList, LONGEST_SHELVING, Transition};
 pub use spec::AlarmSpec;
+pub use state::{AlarmEvent, AlarmMachine};
+
+#[cfg(test)]
+mod fixture;
+#[cfg(test)]
+mod tests;

@@ -13,10 +13,11 @@ pub struct AlarmSpec {
     pub on_delay: Duration,
     /// The condition must be gone this long before the alarm returns.
     pub off_delay: Duration,
-    /// Stays after its condition has gone, until it is acknowledged and reset.
+    /// Stays active after its condition has gone, until it is acknowledged and then reset.
     pub latch: bool,
-    /// Alarms that tell the cause: while one of them is active this one is suppressed.
+    /// Alarms that tell the cause: while the condition of one of them holds (its delays included) this one is
+    /// suppressed, shelved or suppressed itself as that one may be. One that is out of service suppresses nothing.
     pub suppressed_by: Vec<AlarmIndex>,
-    /// First-out group: the first alarm of a group to be raised since all of it was quiet is marked.
+    /// First-out group: the first alarm of a group to be raised since none of it was active is marked.
     pub first_out_group: Option<u32>,
 }
