@@ -56,6 +56,7 @@ impl Client {
         let pace = Pace {
             first: Duration::from_millis(20),
             longest: Duration::from_millis(40),
+            refused: Duration::from_millis(40),
             silence: Duration::from_millis(200),
             ..Pace::default()
         };

@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use super::settings::{BACK_OFF_FIRST, BACK_OFF_LONGEST, HEALTHY_AFTER, SILENCE};
+use super::settings::{BACK_OFF_FIRST, BACK_OFF_LONGEST, HEALTHY_AFTER, REFUSED, SILENCE};
 
 /// How long to wait for what.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -14,6 +14,8 @@ pub struct Pace {
     pub first: Duration,
     /// Longest wait of all.
     pub longest: Duration,
+    /// Longest wait after a refusal that only a person can mend; the shortest is half of it.
+    pub refused: Duration,
     /// A session that lasted this long starts the waits anew.
     pub healthy_after: Duration,
     /// Shortest time without an acknowledgement that ends a session; one and a half times the keep alive if that is
@@ -26,6 +28,7 @@ impl Default for Pace {
         Self {
             first: BACK_OFF_FIRST,
             longest: BACK_OFF_LONGEST,
+            refused: REFUSED,
             healthy_after: HEALTHY_AFTER,
             silence: SILENCE,
         }
@@ -58,11 +61,11 @@ impl BackOff {
         ceiling.mul_f64(chance.clamp(0.0, 1.0)).max(self.pace.first / 10)
     }
 
-    /// The broker refused the session for a reason that only a person can mend: the longest waits at once, so that
+    /// The broker refused the session for a reason that only a person can mend: long waits at once, so that
     /// no broker locks the account for too many tries.
     pub fn after_refusal(&mut self, chance: f64) -> Duration {
         self.failures = u32::MAX;
-        self.pace.longest.mul_f64(0.5 + 0.5 * chance.clamp(0.0, 1.0))
+        self.pace.refused.mul_f64(0.5 + 0.5 * chance.clamp(0.0, 1.0))
     }
 
     /// Failures since the last session that lasted.

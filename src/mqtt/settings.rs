@@ -13,6 +13,8 @@ use serde::{Deserialize, Deserializer, Serialize};
 pub const BACK_OFF_FIRST: Duration = Duration::from_secs(1);
 /// Longest wait between two attempts, unless `reconnect_max_s` says otherwise.
 pub const BACK_OFF_LONGEST: Duration = Duration::from_secs(60);
+/// Longest wait after a refusal that only a person can mend, whatever `reconnect_max_s` says.
+pub const REFUSED: Duration = Duration::from_secs(60);
 /// A session must last this long before the waits start again from [`BACK_OFF_FIRST`].
 pub const HEALTHY_AFTER: Duration = Duration::from_secs(60);
 /// Shortest time without an acknowledgement that ends a session.
@@ -47,7 +49,7 @@ pub struct MqttSettings {
     #[serde(deserialize_with = "reconnect_max")]
     #[schemars(range(min = 1, max = 3600))]
     pub reconnect_max_s: u16,
-    /// Quality of service of `<node>/state` and `bridge/health`: 0 or 1. Everything else is always sent with 1.
+    /// Quality of service of `<node>/state`: 0 or 1. Everything else is always sent with 1.
     #[schemars(with = "u8", range(min = 0, max = 1))]
     pub qos_state: StateQos,
     /// Messages that may wait for their acknowledgement at the same time, 1..=1000.
