@@ -76,6 +76,8 @@ pub struct Gateway {
     pub(super) outputs: VecDeque<Output>,
     /// When alarms that are held back are to be looked at again.
     pub(super) next_look: Option<Instant>,
+    /// When the data of a TPDO may be too old.
+    pub(super) next_expiry: Option<Instant>,
 }
 
 impl Gateway {
@@ -95,6 +97,7 @@ impl Gateway {
             dirty_buses: Marks::new(table.buses.len()),
             outputs: VecDeque::new(),
             next_look: None,
+            next_expiry: None,
             nodes,
             table,
         };
@@ -159,10 +162,10 @@ impl Gateway {
         if self.next_look.is_some_and(|due| due <= now.instant) {
             self.next_look = None;
             for node in (0..self.nodes.len()).map(NodeIndex) {
-                self.expire_data_of_lost_node(now, node);
                 self.refresh_node(now, node);
             }
         }
+        self.expire_data(now);
         self.tags.handle_timeout(&self.table, now);
         self.conditions.handle_timeout(now);
         self.events.handle_timeout(now);
@@ -181,6 +184,7 @@ impl Gateway {
         let silences = self.buses.iter().filter_map(|bus| Some((bus.silent_at()?, "bus silence")));
         let own = [
             (self.next_look, "alarm held back"),
+            (self.next_expiry, "data too old"),
             (self.tags.poll_timeout(), "next second"),
             (self.conditions.poll_timeout(), "alarm delay"),
             (self.events.poll_timeout(), "folded events"),
@@ -265,12 +269,15 @@ impl Gateway {
 
     /// The tags of a node, or of one of its TPDOs, can be trusted less.
     pub(super) fn degrade(&mut self, now: Now, node: NodeIndex, pdo: Option<PdoIndex>, quality: Quality) {
-        if self.tags.degrade(&self.table, now, node, pdo, quality)
-            && let Some(node) = self.nodes.get_mut(node.0)
-        {
+        let changed = self.tags.degrade(&self.table, now, node, pdo, quality);
+        self.dirty_nodes.mark(node.0);
+        let Some(node) = self.nodes.get_mut(node.0) else { return };
+        if changed {
             node.status.generation = node.status.generation.wrapping_add(1);
         }
-        self.dirty_nodes.mark(node.0);
+        if !quality.is_usable() {
+            node.forget_freshness(pdo);
+        }
     }
 
     /// Carries changes of tags on to the alarms, and those of alarms to the journal.

@@ -29,6 +29,8 @@ pub(super) struct Node {
     pub(super) last_toggle_error: Option<Instant>,
     /// Guard requests stay without answer: until then it will have answered, or be lost.
     pub(super) suspect_until: Option<Instant>,
+    /// By TPDO: when its data is too old, where that can happen and has not yet.
+    pub(super) fresh_until: Vec<Option<Instant>>,
     /// By TPDO: set reserved bits of the last frame.
     pub(super) reserved: Vec<u64>,
     /// By TPDO: that it is too long has been told.
@@ -63,6 +65,7 @@ impl Node {
             duplicate: false,
             last_toggle_error: None,
             suspect_until: None,
+            fresh_until: vec![None; pdos.len()],
             reserved: vec![0; pdos.len()],
             told_too_long: vec![false; pdos.len()],
         }
@@ -90,6 +93,15 @@ impl Node {
         let sends_pdos = def.canopen.pdos.iter().any(|pdo| pdo.timeout.is_some());
         let may_send = matches!(self.nmt, None | Some(NmtState::Operational));
         is_watched(def) || (sends_pdos && may_send)
+    }
+
+    /// The data of a TPDO, or of all, is not usable any more and need not be watched.
+    pub(super) fn forget_freshness(&mut self, pdo: Option<PdoIndex>) {
+        for (place, fresh_until) in self.fresh_until.iter_mut().enumerate() {
+            if pdo.is_none_or(|pdo| pdo.0 == place) {
+                *fresh_until = None;
+            }
+        }
     }
 
     /// TPDOs are not expected any more.
@@ -206,23 +218,37 @@ impl Gateway {
         self.next_look = Some(self.next_look.map_or(at, |next| next.min(at)));
     }
 
-    /// Data that came while the node was lost is uncertain, and nobody else watches that it goes on coming: when it
-    /// does not, it is as bad as all else of a lost node.
-    pub(super) fn expire_data_of_lost_node(&mut self, now: Now, index: NodeIndex) {
-        let Some(def) = self.table.nodes.get(index.0) else { return };
-        let Some(node) = self.nodes.get(index.0).filter(|node| node.lost.is_some()) else { return };
-        let pdos = def.canopen.pdos.iter().zip(&node.status.pdos).enumerate();
-        let due: Vec<(PdoIndex, Instant)> = pdos
-            .filter_map(|(place, (pdo, status))| {
-                Some((PdoIndex(place), status.last_received? + pdo.timeout?))
-            })
-            .collect();
-        for (pdo, due) in due {
-            if due > now.instant {
-                self.look_again_at(due);
-            } else {
-                self.degrade(now, index, Some(pdo), Quality::Bad(Reason::NodeLost));
+    /// No data older than the timeout of its TPDO is usable, whatever the network believes of the node: it watches
+    /// TPDOs only while they have to come, not while a node is lost, or was told to stop.
+    pub(super) fn expire_data(&mut self, now: Now) {
+        if self.next_expiry.is_none_or(|due| due > now.instant) {
+            return;
+        }
+        self.next_expiry = None;
+        for index in (0..self.nodes.len()).map(NodeIndex) {
+            let pdos = self.table.nodes.get(index.0).map_or(0, |def| def.canopen.pdos.len());
+            for pdo in (0..pdos).map(PdoIndex) {
+                self.expire_pdo(now, index, pdo);
             }
         }
+    }
+
+    fn expire_pdo(&mut self, now: Now, index: NodeIndex, pdo: PdoIndex) {
+        let Some(node) = self.nodes.get_mut(index.0) else { return };
+        let Some(fresh_until) = node.fresh_until.get_mut(pdo.0) else { return };
+        match *fresh_until {
+            Some(until) if until <= now.instant => {
+                let lost = node.lost.is_some();
+                let quality =
+                    if lost { Quality::Bad(Reason::NodeLost) } else { Quality::Stale(Reason::PdoTimeout) };
+                self.degrade(now, index, Some(pdo), quality);
+            }
+            Some(until) => self.expire_at(until),
+            None => {}
+        }
+    }
+
+    pub(super) fn expire_at(&mut self, at: Instant) {
+        self.next_expiry = Some(self.next_expiry.map_or(at, |next| next.min(at)));
     }
 }

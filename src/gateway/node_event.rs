@@ -84,7 +84,11 @@ impl Gateway {
         let number = status.number;
         node.status.newest_data = Some(now.utc);
         let quality = node.quality_of_new_data();
-        let expires = def.canopen.pdos.get(pdo.0).and_then(|pdo| pdo.timeout).filter(|_| node.lost.is_some());
+        let fresh_until =
+            def.canopen.pdos.get(pdo.0).and_then(|pdo| pdo.timeout).map(|timeout| now.instant + timeout);
+        if let Some(known) = node.fresh_until.get_mut(pdo.0) {
+            *known = fresh_until;
+        }
 
         if let Some(padding) = data.get_mut(usize::from(length)..) {
             padding.fill(0);
@@ -96,8 +100,8 @@ impl Gateway {
             node.status.generation = node.status.generation.wrapping_add(1);
         }
         self.dirty_nodes.mark(index.0);
-        if let Some(timeout) = expires {
-            self.look_again_at(now.instant + timeout);
+        if let Some(until) = fresh_until {
+            self.expire_at(until);
         }
         if reserved != 0 {
             self.count(index, |counters| &mut counters.reserved_bits);

@@ -8,6 +8,7 @@
 //! 350   tag trip = true good     a tag as readers see it now
 //! 1600  alarm node_lost unacknowledged
 //! 1600  event node_lost          such an event was journalled since the event before
+//! 1600  reply 701#05             answers the guard request of this moment, else the next one, 1 ms after it
 //! ```
 //!
 //! Every frame that the gateway sends must stand in the script, guard requests excepted: those are only looked at
@@ -21,8 +22,8 @@ use cangate::canopen::NmtRequest;
 use cangate::gateway::{Action, Command, CommandSource, Gateway, Health, Input, Outcome, Output};
 use cangate::mapping::{AlarmOwner, TagTable};
 use cangate::process_image::{
-    AlarmIndex, AlarmState, AlarmStatus, BusStatus, Event, NodeIndex, NodeStatus, ProcessImage, Sample,
-    TagIndex,
+    AlarmIndex, AlarmState, AlarmStatus, BusStatus, Event, EventKind, NodeIndex, NodeStatus, ProcessImage,
+    Sample, TagIndex,
 };
 use cangate::time::{Instant, Now, Timestamp};
 
@@ -124,9 +125,29 @@ impl Conversation {
         self.cyclic.retain(|frame, _| !frame.starts_with(prefix));
     }
 
+    /// Whole milliseconds since the start.
+    pub fn now_millis(&self) -> u64 {
+        self.now.as_millis()
+    }
+
     /// Time runs on to so many ms after the start.
     pub fn run_to(&mut self, millis: u64) {
-        let end = Instant::from_millis(millis);
+        self.run_to_instant(Instant::from_millis(millis));
+    }
+
+    /// To the next guard request unless one was sent right now, and 1 ms on; then the reply arrives.
+    fn reply(&mut self, frame: &str) {
+        let requests = self.guard_requests.len();
+        let just_asked = self.guard_requests.last().is_some_and(|(at, _)| *at == self.now);
+        while !just_asked && self.guard_requests.len() == requests {
+            let (due, _) = self.gateway.poll_timeout().expect("the gateway guards its nodes");
+            self.run_to_instant(due.max(self.now));
+        }
+        self.run_to_instant(Instant::from_micros(self.now.as_micros() + 1_000));
+        self.frame(frame);
+    }
+
+    fn run_to_instant(&mut self, end: Instant) {
         assert!(end >= self.now, "time does not run backwards");
         loop {
             let due = self.gateway.poll_timeout().map(|(due, _)| due.max(self.now));
@@ -232,10 +253,10 @@ impl Conversation {
         self.image.alarms[place.unwrap()]
     }
 
-    /// Names of all alarms that were ever raised (suppressed ones were not).
-    pub fn raised(&self) -> Vec<&str> {
-        let alarms = self.table.alarms.iter().zip(&self.image.alarms);
-        alarms.filter(|(_, status)| status.count > 0).map(|(alarm, _)| alarm.name.as_str()).collect()
+    /// Names of all alarms that were ever raised (suppressed ones were not), as often as they were.
+    pub fn raised(&self) -> Vec<String> {
+        let is_raised = |event: &Event| event.kind == EventKind::Alarm && event.to == "unacknowledged";
+        self.events().into_iter().filter(is_raised).map(|event| event.name).collect()
     }
 
     /// Names of all alarms that are active now.
@@ -273,6 +294,7 @@ impl Conversation {
                 assert!(self.guard_requests.contains(&wanted), "{line}: sent {:?}", self.guard_requests);
             }
             "->" => assert_eq!(self.sent.pop_front(), Some((self.now, rest.to_owned())), "{line}"),
+            "reply" => self.reply(rest),
             "tag" => {
                 let (name, wanted) = rest.split_once(" = ").unwrap_or_else(|| panic!("`{line}`"));
                 assert_eq!(self.tag_text(name), wanted, "{line}");
