@@ -41,6 +41,9 @@ const SEND_BUFFER: usize = 1;
 /// 100 kbit/s, so that a queue that moves at all takes it.
 const TRIES: u32 = 20;
 
+/// The same after a frame that was given up. More than one, so that a caller who insists still leaves others room.
+const TRIES_WHEN_STUCK: u32 = 2;
+
 #[derive(Debug)]
 struct Shared {
     name: String,
@@ -270,14 +273,14 @@ fn io_error(name: &str, source: io::Error) -> BusError {
 #[derive(Debug)]
 pub struct SocketWriter {
     shared: Arc<Shared>,
-    /// The queue was full to the end last time: one try is enough to see whether it moves again.
+    /// The queue was full to the end last time: it need not be waited for again until it moves.
     stuck: bool,
 }
 
 impl BusWriter for SocketWriter {
     async fn send(&mut self, frame: &CanFrame) -> Result<(), BusError> {
         let message = raw_frame::encode(frame);
-        let mut tries = if self.stuck { 1 } else { TRIES };
+        let mut tries = if self.stuck { TRIES_WHEN_STUCK } else { TRIES };
         loop {
             match send(self.shared.socket.get_ref().as_raw_fd(), &message, MsgFlags::MSG_DONTWAIT) {
                 Ok(_) => {

@@ -11,6 +11,7 @@
 //! | `silence` | which frames the gateway ever sends, also when it is stopped or killed; the passive role |
 //! | `faults` | interface down, deleted, bus-off; a full bus |
 //! | `broker` | a broker that is killed again and again |
+//! | `socket` | the bus room alone: link states, lost frames, full queues, receive times |
 //! | `many` | two devices, two clients, a second master |
 //!
 //! vcan0 is there once, so the tests run one after another; each begins with a new interface.
@@ -44,4 +45,5 @@ mod harness_itself;
 mod many;
 mod pulse;
 mod silence;
+mod socket;
 mod start;
