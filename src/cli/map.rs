@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
+use crate::modbus::gateway_block::MAP_VERSION;
 use crate::modbus::{MapDocument, Point, RegisterMap, Table, WordOrder};
 
 /// How the map is printed.
@@ -70,8 +71,11 @@ fn terminal(points: &[Point], map: &RegisterMap) -> String {
         .map(|column| rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max())
         .map(Option::unwrap_or_default)
         .collect();
-    let mut text =
-        format!("Map {} version 1, 32-bit values {}\n\n", map.hash_text(), map.word_order().letters());
+    let mut text = format!(
+        "Map {} version {MAP_VERSION}, 32-bit values {}\n\n",
+        map.hash_text(),
+        map.word_order().letters()
+    );
     for row in rows {
         let line: Vec<String> =
             row.iter().zip(&widths).map(|(cell, width)| format!("{cell:width$}")).collect();
@@ -119,10 +123,13 @@ fn quoted(cell: &str) -> String {
     cell.to_owned()
 }
 
+/// One point to a line, so that two maps can be compared as texts too.
 fn json(map: &RegisterMap) -> String {
-    let document = MapDocument { version: 1, hash: map.hash_text(), points: map.points().to_vec() };
     // Plain structs of texts and numbers: there is nothing that could not be written.
-    serde_json::to_string_pretty(&document).unwrap_or_default() + "\n"
+    let lines: Vec<String> =
+        map.points().iter().map(|point| serde_json::to_string(point).unwrap_or_default()).collect();
+    let (hash, points) = (map.hash_text(), lines.join(",\n"));
+    format!("{{\"version\":{MAP_VERSION},\"hash\":\"{hash}\",\"points\":[\n{points}\n]}}\n")
 }
 
 fn markdown(points: &[Point], map: &RegisterMap) -> String {
@@ -143,7 +150,7 @@ fn markdown(points: &[Point], map: &RegisterMap) -> String {
         TOPIC,
     ];
     let mut text = format!(
-        "# Register map\n\nVersion 1, hash `{}`, 32-bit values {}.\n\nAddress: as on the wire, from 0. Number: from 1. \
+        "# Register map\n\nVersion {MAP_VERSION}, hash `{}`, 32-bit values {}.\n\nAddress: as on the wire, from 0. Number: from 1. \
          Every input register (3xxxxx) can be read as the holding register (4xxxxx) of the same address too, every \
          discrete input (1xxxxx) as a coil (0xxxxx).\nWhat a block leaves out is reserved and reads 0.\n",
         map.hash_text(),

@@ -192,13 +192,14 @@ fn tag_point(
 
 /// Name, text and topic of the alarms that share a bit: of the one, or of the array.
 fn alarm_names(table: &TagTable, alarms: &[AlarmIndex], topic: &str) -> (String, String, String) {
-    let mut defs = alarms.iter().filter_map(|alarm| table.alarms.get(alarm.0));
-    let Some(first) = defs.next() else { return (String::new(), String::new(), String::new()) };
-    match defs.count() {
-        0 => (first.name.clone(), first.text.clone(), format!("{topic}/alarm/{}", first.name)),
-        more => {
+    let defs: Vec<_> = alarms.iter().filter_map(|alarm| table.alarms.get(alarm.0)).collect();
+    match defs.as_slice() {
+        [] => (String::new(), String::new(), String::new()),
+        [one] => (one.name.clone(), one.text.clone(), format!("{topic}/alarm/{}", one.name)),
+        [first, .., last] => {
             let name = first.name.trim_end_matches(|c: char| c.is_ascii_digit()).trim_end_matches('_');
-            (name.to_owned(), format!("any of {}: {}", more + 1, first.text), format!("{topic}/alarm/+"))
+            let text = format!("one of {} .. {}", first.name, last.name);
+            (name.to_owned(), text, format!("{topic}/alarm/+"))
         }
     }
 }
