@@ -82,6 +82,12 @@ impl EventDriven {
         }
     }
 
+    /// Whether a frame is due that is to tell of an event.
+    #[must_use]
+    pub fn event_is_due(&self, now: Instant) -> bool {
+        self.event.is_some() && self.due().is_some_and(|due| due <= now)
+    }
+
     /// When the next is due; `None` while stopped.
     #[must_use]
     pub fn due(&self) -> Option<Instant> {

@@ -152,8 +152,8 @@ impl Detcon {
         self.silence();
     }
 
-    /// Changes the values. What follows from it on the bus follows at once (R-DET-069, R-DET-071); a frame that is due at
-    /// this very moment carries the new values.
+    /// Changes the values. What follows from it on the bus follows at once (R-DET-069, R-DET-071). A periodic frame that is
+    /// due at this very moment carries the new values.
     pub fn update(&mut self, now: Now, change: impl FnOnce(&mut Values)) {
         self.advance_before(now.instant);
         let (knocking, event_bytes) = (self.values.is_knocking(), self.event_bytes());
@@ -214,10 +214,14 @@ impl Detcon {
         }
     }
 
-    /// Does what was due before `now`, and leaves what is due just now.
+    /// Does what was due before `now`, and leaves what is due just now: but for a frame that tells of an earlier event,
+    /// so that a pulse as long as the inhibit time is always seen.
     fn advance_before(&mut self, now: Instant) {
         while let Some((_, work)) = self.next_work().filter(|(due, _)| *due < now) {
             self.perform(now, work);
+        }
+        if self.status.event_is_due(now) {
+            self.send_tpdo(now, Tpdo::Three);
         }
     }
 

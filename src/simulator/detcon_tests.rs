@@ -317,6 +317,18 @@ fn r_det_073_change_and_reversal_inside_the_inhibit_window_still_sends_one_frame
 }
 
 #[test]
+fn a_pulse_as_long_as_the_inhibit_time_is_seen_whatever_its_phase() {
+    for phase in 0..=500 {
+        let mut bench = Bench::operational(in_phase(), 1000);
+        bench.update(1500 + phase, |values| values.set_status(StatusBit::Trip, true));
+        bench.update(1600 + phase, |values| values.set_status(StatusBit::Trip, false));
+        bench.run_to(3000);
+        let log = bench.take();
+        assert!(log.iter().any(|(_, frame)| frame.starts_with("381#02")), "{phase}: {log:?}");
+    }
+}
+
+#[test]
 fn r_det_074_changes_of_bytes_2_to_7_alone_send_nothing() {
     let mut bench = Bench::operational(in_phase(), 1000);
     bench.update(1200, |values| {

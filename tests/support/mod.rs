@@ -4,3 +4,4 @@ pub mod fake_broker;
 pub mod modbus;
 pub mod plant;
 pub mod registers;
+pub mod world;

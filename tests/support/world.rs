@@ -1,0 +1,319 @@
+//! A gateway and simulated devices on one bus, in numbers-time: no socket, no task, no clock.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use cangate::can::{BusEvent, BusIndex, CanFrame, Link};
+use cangate::canopen::NodeId;
+use cangate::gateway::{Gateway, Input, Output};
+use cangate::mapping::installation::{BusEntry, NodeEntry};
+use cangate::mapping::{At, Installation, Source, SourceText, TagTable, build};
+use cangate::process_image::{NodeIndex, NodeStatus, ProcessImage, Quality, Sample};
+use cangate::simulator::random::Random;
+use cangate::simulator::{Control, DevicePlan, Order, Scenario, SimulatedDevice};
+use cangate::time::{Instant, Now, Timestamp};
+
+const BUS: BusIndex = BusIndex(0);
+
+/// An installation of `count` devices on one bus: `node001` with node id 1, and so on.
+pub fn installation(count: u8) -> Arc<TagTable> {
+    let at = |text: String| At::nowhere(text);
+    let buses = BTreeMap::from([(at("can0".into()), BusEntry::virtual_bus("can0"))]);
+    let entry = |id| NodeEntry::new("can0", id, "motortech-detcon");
+    let nodes = (1..=count).map(|id| (at(format!("node{id:03}")), entry(id))).collect();
+    let installation = Installation {
+        gateway: "test",
+        gateway_unit_id: 247,
+        config: &SourceText::new("test.toml", ""),
+        buses: &buses,
+        nodes: &nodes,
+        mappings: &BTreeMap::new(),
+    };
+    Arc::new(build(&installation).unwrap_or_else(|problems| panic!("{problems:#?}")).0)
+}
+
+/// What the bus does to frames. The default is a good bus: each frame arrives once, 200 us later.
+#[derive(Clone, Copy, Debug)]
+pub struct Weather {
+    /// Of 1000 frames, so many do not arrive.
+    pub lost: i32,
+    /// Of 1000 frames, so many arrive twice.
+    pub doubled: i32,
+    /// A frame takes up to so long; the order is kept, as on a bus.
+    pub longest_delay: Duration,
+}
+
+impl Default for Weather {
+    fn default() -> Self {
+        Self { lost: 0, doubled: 0, longest_delay: Duration::from_micros(200) }
+    }
+}
+
+/// Who sent a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Sender {
+    Gateway,
+    Device(usize),
+}
+
+/// The bus, who is on it, and the time.
+pub struct World {
+    pub table: Arc<TagTable>,
+    pub image: ProcessImage,
+    pub weather: Weather,
+    gateway: Option<Gateway>,
+    devices: Vec<SimulatedDevice>,
+    in_flight: BTreeMap<(Instant, u64), (Sender, CanFrame)>,
+    sequence: u64,
+    last_arrival: Instant,
+    random: Random,
+    now: Instant,
+    /// What the gateway sent, without repetitions.
+    pub sent: BTreeSet<String>,
+    /// Names of all alarms that an operator was called by, whether they still hold or not.
+    pub raised: BTreeSet<String>,
+    /// The last event that was looked at.
+    cursor: u64,
+}
+
+impl World {
+    /// An empty bus for `count` devices, at 0 s. `seed` chooses the weather's luck.
+    pub fn new(count: u8, seed: u64) -> Self {
+        Self {
+            table: installation(count),
+            image: ProcessImage::default(),
+            weather: Weather::default(),
+            gateway: None,
+            devices: Vec::new(),
+            in_flight: BTreeMap::new(),
+            sequence: 0,
+            last_arrival: Instant::START,
+            random: Random::new(seed),
+            now: Instant::START,
+            sent: BTreeSet::new(),
+            raised: BTreeSet::new(),
+            cursor: 0,
+        }
+    }
+
+    /// A gateway and `count` healthy devices that have run for 5 s.
+    pub fn running(count: u8) -> Self {
+        let mut world = Self::new(count, 1);
+        world.start_gateway();
+        for id in 1..=count {
+            world.power_on(id, "quiet");
+        }
+        world.run_for(5000);
+        world
+    }
+
+    pub fn now(&self) -> Now {
+        let micros = i64::try_from(self.now.as_micros()).unwrap();
+        Now { instant: self.now, utc: Timestamp::from_micros(micros) }
+    }
+
+    /// Milliseconds since the begin.
+    pub fn millis(&self) -> u64 {
+        self.now.as_millis()
+    }
+
+    /// The gateway starts now, on a bus that is up.
+    pub fn start_gateway(&mut self) {
+        let mut gateway = Gateway::new(Arc::clone(&self.table), self.now());
+        self.image = gateway.empty_image();
+        self.cursor = 0;
+        let event = BusEvent::Link { link: Link::ErrorActive, at: self.now() };
+        gateway.handle_input(self.now(), Input::Bus { bus: BUS, event });
+        self.gateway = Some(gateway);
+        self.settle();
+    }
+
+    /// A device is connected and powered on now, with a shipped scenario.
+    pub fn power_on(&mut self, id: u8, scenario: &str) {
+        let scenario = Scenario::shipped(scenario).unwrap();
+        let plan = DevicePlan::new(NodeId::new(id).unwrap(), scenario);
+        self.devices.push(SimulatedDevice::power_on(&plan, self.now()));
+        self.settle();
+    }
+
+    /// An order to one device (`node 2 power off`) or to all.
+    pub fn order(&mut self, line: &str) {
+        let Order { node, control } = line.parse().unwrap();
+        self.control(node, control);
+    }
+
+    fn control(&mut self, node: Option<NodeId>, control: Control) {
+        let now = self.now();
+        for device in &mut self.devices {
+            if node.is_none_or(|node| node == device.node()) {
+                device.handle_control(now, control);
+            }
+        }
+        self.settle();
+    }
+
+    /// Lets time pass.
+    pub fn run_for(&mut self, millis: u64) {
+        let end = self.now + Duration::from_millis(millis);
+        while let Some(next) = self.next_due().filter(|next| *next <= end) {
+            self.now = next.max(self.now);
+            self.step();
+        }
+        self.now = end;
+    }
+
+    /// Lets time pass until something holds, and gives how many milliseconds that took.
+    #[track_caller]
+    pub fn run_until(&mut self, at_most: u64, holds: impl Fn(&Self) -> bool) -> u64 {
+        let (start, end) = (self.millis(), self.now + Duration::from_millis(at_most));
+        while !holds(self) {
+            let next = self.next_due().filter(|next| *next <= end);
+            let Some(next) = next else {
+                panic!("did not happen within {at_most} ms; active: {:?}", self.active_alarms());
+            };
+            self.now = next.max(self.now);
+            self.step();
+        }
+        self.millis() - start
+    }
+
+    fn next_due(&self) -> Option<Instant> {
+        let devices = self.devices.iter().filter_map(SimulatedDevice::poll_timeout);
+        let gateway = self.gateway.iter().filter_map(|gateway| Some(gateway.poll_timeout()?.0));
+        devices.chain(gateway).chain(self.in_flight.keys().next().map(|(due, _)| *due)).min()
+    }
+
+    fn step(&mut self) {
+        let now = self.now();
+        while let Some(entry) = self.in_flight.first_entry().filter(|entry| entry.key().0 <= now.instant) {
+            let (sender, frame) = entry.remove();
+            self.deliver(now, sender, frame);
+        }
+        for device in &mut self.devices {
+            if device.poll_timeout().is_some_and(|due| due <= now.instant) {
+                device.handle_timeout(now);
+            }
+        }
+        if let Some(gateway) = &mut self.gateway
+            && gateway.poll_timeout().is_some_and(|(due, _)| due <= now.instant)
+        {
+            gateway.handle_timeout(now);
+        }
+        self.settle();
+    }
+
+    /// Devices listen to NMT commands and to remote frames only.
+    fn deliver(&mut self, now: Now, sender: Sender, frame: CanFrame) {
+        if frame.is_remote() || frame.id().raw() == 0 {
+            for (place, device) in self.devices.iter_mut().enumerate() {
+                if sender != Sender::Device(place) {
+                    device.handle_frame(now, &frame);
+                }
+            }
+        }
+        if let (Some(gateway), Sender::Device(_)) = (&mut self.gateway, sender) {
+            let event = BusEvent::Frame { frame, at: now };
+            gateway.handle_input(now, Input::Bus { bus: BUS, event });
+            // Frames are worked off one by one, as the task does.
+            self.settle_gateway();
+        }
+    }
+
+    fn settle(&mut self) {
+        self.settle_gateway();
+        for place in 0..self.devices.len() {
+            while let Some(frame) = self.devices[place].poll_output() {
+                self.send(Sender::Device(place), frame);
+            }
+        }
+    }
+
+    fn settle_gateway(&mut self) {
+        let Some(mut gateway) = self.gateway.take() else { return };
+        while let Some(output) = gateway.poll_output() {
+            match output {
+                Output::Transmit { frame, .. } => {
+                    self.sent.insert(frame.to_string());
+                    self.send(Sender::Gateway, frame);
+                }
+                Output::Reply { .. } => {}
+            }
+        }
+        gateway.publish(&mut self.image);
+        self.gateway = Some(gateway);
+        if self.image.journal.newest() != self.cursor {
+            let (events, _) = self.image.journal.after(self.cursor);
+            self.cursor = self.image.journal.newest();
+            let calls =
+                events.into_iter().filter(|event| event.alarm.is_some() && event.to == "unacknowledged");
+            self.raised.extend(calls.map(|event| event.name));
+        }
+    }
+
+    fn send(&mut self, sender: Sender, frame: CanFrame) {
+        let copies = if self.random.between(0, 999) < self.weather.lost {
+            0
+        } else if self.random.between(0, 999) < self.weather.doubled {
+            2
+        } else {
+            1
+        };
+        for _ in 0..copies {
+            let longest = i32::try_from(self.weather.longest_delay.as_micros()).unwrap();
+            let delay = u64::try_from(self.random.between(longest / 2, longest)).unwrap();
+            let arrival = (self.now + Duration::from_micros(delay)).max(self.last_arrival);
+            self.last_arrival = arrival;
+            self.sequence += 1;
+            self.in_flight.insert((arrival, self.sequence), (sender, frame));
+        }
+    }
+
+    fn index(&self, id: u8) -> NodeIndex {
+        self.table.find_node(&format!("node{id:03}")).unwrap()
+    }
+
+    /// What the gateway knows of a node.
+    pub fn node(&self, id: u8) -> &NodeStatus {
+        self.image.node(self.index(id)).unwrap()
+    }
+
+    /// A tag of a node.
+    pub fn tag(&self, id: u8, name: &str) -> Sample {
+        *self.image.tag(self.table.find_tag(self.index(id), name).unwrap())
+    }
+
+    /// A number of a node.
+    pub fn number(&self, id: u8, name: &str) -> f64 {
+        self.tag(id, name).value.as_f64()
+    }
+
+    /// The qualities of all tags that come in TPDOs of a node, each once.
+    pub fn qualities(&self, id: u8) -> Vec<Quality> {
+        let mut qualities = Vec::new();
+        for place in self.table.nodes[self.index(id).0].tags.clone() {
+            let quality = self.image.tags[place].quality;
+            let received = matches!(self.table.tags[place].source, Source::Pdo { .. });
+            if received && !qualities.contains(&quality) {
+                qualities.push(quality);
+            }
+        }
+        qualities
+    }
+
+    /// Whether all process data of a node is good.
+    pub fn is_good(&self, id: u8) -> bool {
+        self.qualities(id) == [Quality::Good]
+    }
+
+    /// Names of the alarms that hold and are shown, in the order of the table.
+    pub fn active_alarms(&self) -> Vec<&str> {
+        let alarms = self.table.alarms.iter().zip(&self.image.alarms);
+        alarms.filter(|(_, status)| status.state.is_active()).map(|(alarm, _)| alarm.name.as_str()).collect()
+    }
+
+    /// How often an event is in the journal.
+    pub fn events(&self, name: &str) -> usize {
+        self.image.journal.newest_first().filter(|event| event.name == name).count()
+    }
+}
