@@ -76,7 +76,7 @@ pub struct NodeEntry {
     pub id: At<u64>,
     /// Device mapping: the name of a file in `mappings/`, or a path.
     pub mapping: At<String>,
-    /// Modbus unit id, 1..=246. Default: the node id.
+    /// Modbus unit id, 1..=247 without that of the gateway itself. Default: the node id.
     pub unit_id: Option<At<u64>>,
     /// Added to every Modbus address, so that several nodes can share one unit id. Default: 0.
     pub offset: Option<At<u64>>,

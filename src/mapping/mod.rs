@@ -29,11 +29,18 @@ pub mod table;
 pub mod testing;
 
 pub use at::At;
-pub use build::{Installation, build, check_mapping};
+pub use build::{Installation, build, check_mapping, is_name, sort_problems};
 pub use diagnostic::{Diagnostic, Severity, SourceText};
 pub use expression::Expression;
-pub use shipped::{SHIPPED, shipped};
+pub use reader::locate;
+pub use shipped::shipped;
 pub use table::{
     AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, BusDef, Derived, DeviceDef, Encoding, Field, FieldKind,
     NodeDef, OnLoss, PublishDef, RegisterDef, Scale, Source, Space, TagDef, TagTable,
 };
+
+/// JSON Schema of a device mapping, for editors.
+#[must_use]
+pub fn schema() -> serde_json::Value {
+    schemars::schema_for!(file::MappingFile).to_value()
+}

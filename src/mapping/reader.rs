@@ -151,6 +151,21 @@ fn name_of(value: &DeValue<'_>) -> Option<String> {
     value.get("name")?.get_ref().as_str().map(str::to_owned)
 }
 
+/// Where a key stands: its value, or as much of the path as there is; `0..0` where there is nothing of it.
+#[must_use]
+pub fn locate(source: &SourceText, path: &[&str]) -> Range<usize> {
+    let (document, _) = DeTable::parse_recoverable(&source.text);
+    let mut table = document.get_ref();
+    let mut span = 0..0;
+    for key in path {
+        let Some(value) = table.get(*key) else { break };
+        span = value.span();
+        let Some(inner) = value.get_ref().as_table() else { break };
+        table = inner;
+    }
+    span
+}
+
 /// The reader's messages in our words, with a hint.
 fn rephrase(message: &str) -> (String, String) {
     let quoted: Vec<&str> = message.split('`').skip(1).step_by(2).collect();

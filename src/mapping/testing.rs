@@ -27,6 +27,7 @@ pub fn detcon(nodes: &[&str]) -> TagTable {
         buses: &buses,
         nodes: &nodes,
         mappings: &BTreeMap::new(),
+        lost: &[],
     };
     match build(&installation) {
         Ok((table, warnings)) => {

@@ -28,7 +28,7 @@ use self::items::{Element, Items};
 use self::network::Taken;
 use self::node::Tpdo;
 use self::problems::Problems;
-pub use self::problems::{is_name, is_snake_case};
+pub use self::problems::{is_name, is_snake_case, sort_problems};
 use self::tags::Context;
 use super::file::MappingFile;
 use super::installation::{BusEntry, NodeEntry};
@@ -64,6 +64,8 @@ pub struct Installation<'a> {
     pub nodes: &'a BTreeMap<At<String>, NodeEntry>,
     /// Mapping files by the name that nodes call them; one that is missing here is looked for among the shipped ones.
     pub mappings: &'a BTreeMap<String, SourceText>,
+    /// Names of buses whose entries could not be read: that they are missing is not told again.
+    pub lost: &'a [String],
 }
 
 /// Builds the tag table of an installation; with it come the warnings. Or everything that is wrong, warnings included.
@@ -104,6 +106,7 @@ pub fn check_mapping(source: &SourceText) -> Result<Vec<Diagnostic>, Vec<Diagnos
         buses: &buses,
         nodes: &nodes,
         mappings: &mappings,
+        lost: &[],
     };
     build(&installation).map(|(_, warnings)| warnings)
 }
@@ -220,7 +223,7 @@ impl Builder<'_> {
     fn bus(&self, problems: &mut Problems, entry: &NodeEntry) -> Option<BusIndex> {
         let name = &entry.bus;
         let found = self.installation.buses.keys().position(|bus| bus.value == name.value).map(BusIndex);
-        if found.is_none() {
+        if found.is_none() && !self.installation.lost.contains(&name.value) {
             let known = self.installation.buses.keys().map(|bus| bus.value.as_str());
             problems.unknown(self.installation.config, &name.span, "bus", &name.value, known);
         }

@@ -45,18 +45,9 @@ impl Problems {
         self.list.iter().any(|problem| problem.severity == Severity::Error)
     }
 
-    /// All of them, by file and place, each once: two nodes with the same mapping find the same problems in it.
-    pub fn sorted(mut self) -> Vec<Diagnostic> {
-        let key = |problem: &Diagnostic| (problem.file.clone(), problem.line, problem.column);
-        self.list.sort_by_key(key);
-        let mut unique: Vec<Diagnostic> = Vec::new();
-        for problem in self.list {
-            let place = key(&problem);
-            if !unique.iter().rev().take_while(|known| key(known) == place).any(|known| *known == problem) {
-                unique.push(problem);
-            }
-        }
-        unique
+    /// All of them, sorted.
+    pub fn sorted(self) -> Vec<Diagnostic> {
+        sort_problems(self.list)
     }
 
     /// A number within limits; the nearest limit where it is not.
@@ -121,6 +112,21 @@ impl Problems {
         };
         self.error(source, span, format!("there is no {what} `{name}`"), hint);
     }
+}
+
+/// By file and place, each once: two nodes with the same mapping find the same problems in it.
+#[must_use]
+pub fn sort_problems(mut problems: Vec<Diagnostic>) -> Vec<Diagnostic> {
+    let key = |problem: &Diagnostic| (problem.file.clone(), problem.line, problem.column);
+    problems.sort_by_key(key);
+    let mut unique: Vec<Diagnostic> = Vec::new();
+    for problem in problems {
+        let place = key(&problem);
+        if !unique.iter().rev().take_while(|known| key(known) == place).any(|known| *known == problem) {
+            unique.push(problem);
+        }
+    }
+    unique
 }
 
 /// Whether a text can be the name of a gateway, bus or node.

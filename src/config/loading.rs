@@ -1,0 +1,273 @@
+//! From the text of the configuration to checked settings and the tag table, or to everything that is wrong.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::Path;
+
+use super::environment;
+use super::settings::Settings;
+use crate::can::interface::Interface;
+use crate::mapping::{
+    At, Diagnostic, Installation, SourceText, TagTable, build, is_name, locate, reader, shipped,
+    sort_problems,
+};
+use crate::mqtt::settings::RESERVED_NODE_NAMES;
+
+/// Version of the configuration that this program reads.
+const VERSION: u64 = 1;
+
+/// A configuration in which nothing is wrong.
+#[derive(Clone, Debug)]
+pub struct Loaded {
+    /// The settings.
+    pub settings: Settings,
+    /// How each bus is reached, by [`BusIndex`](crate::can::BusIndex).
+    pub interfaces: Vec<Interface>,
+    /// Buses, nodes, tags and alarms.
+    pub table: TagTable,
+    /// What works but is probably not meant.
+    pub warnings: Vec<Diagnostic>,
+}
+
+/// Loads a configuration. `variables` are those of the environment; `read_file` is asked for mapping files.
+///
+/// A mapping is called by a path (with a `/`, or ending in `.toml`) relative to the configuration file, or by a name: then it
+/// is `mappings/NAME.toml` beside the configuration file, or else the one that comes with the program.
+pub fn load(
+    source: &SourceText,
+    variables: impl IntoIterator<Item = (String, String)>,
+    read_file: &mut dyn FnMut(&str) -> io::Result<String>,
+) -> Result<Loaded, Vec<Diagnostic>> {
+    let read = reader::read::<Settings>(source);
+    let mut problems = read.problems;
+    let Some(mut settings) = read.content else { return Err(problems) };
+    if settings.version.value != VERSION {
+        let message = format!("version {} is not known to this program", settings.version.value);
+        problems.push(source.error(&settings.version.span, message, format!("it reads version {VERSION}")));
+    }
+    problems.extend(environment::overlay(&mut settings, variables));
+    problems.extend(check(source, &settings));
+    let (interfaces, wrong) = interfaces(source, &settings);
+    problems.extend(wrong);
+    let (mappings, wrong) = mappings(source, &settings, read_file);
+    problems.extend(wrong);
+    let installation = Installation {
+        gateway: &settings.gateway.name,
+        gateway_unit_id: settings.modbus.gateway_unit_id,
+        config: source,
+        buses: &settings.bus,
+        nodes: &settings.node,
+        mappings: &mappings,
+        lost: &read.lost,
+    };
+    match build(&installation) {
+        Ok((table, mut warnings)) if problems.is_empty() => {
+            if settings.node.is_empty() {
+                let hint = "add a [node.NAME] with `bus`, `id` and `mapping`";
+                warnings.push(source.warning(&(0..0), "there is no node, so there is nothing to show", hint));
+            }
+            Ok(Loaded { settings, interfaces, table, warnings })
+        }
+        Ok((_, more)) | Err(more) => {
+            problems.extend(more);
+            Err(sort_problems(problems))
+        }
+    }
+}
+
+/// What the rooms' settings say of themselves, and what only holds for several of them together.
+fn check(source: &SourceText, settings: &Settings) -> Vec<Diagnostic> {
+    let mut problems = Vec::new();
+    if !is_name(&settings.gateway.name) {
+        let message = format!("`{}` cannot be the name of a gateway", settings.gateway.name);
+        let span = locate(source, &["gateway", "name"]);
+        problems.push(source.error(&span, message, "use 1 to 64 of a-z, 0-9, _ and -"));
+    }
+    for problem in settings.modbus.problems() {
+        let span = locate(source, &["modbus", problem.key]);
+        let hint = format!("use {} to {}", problem.lowest, problem.highest);
+        problems.push(source.error(&span, problem.to_string(), hint));
+    }
+    for name in settings.node.keys().filter(|name| RESERVED_NODE_NAMES.contains(&name.value.as_str())) {
+        let message = format!("`{}` cannot be the name of a node", name.value);
+        problems.push(source.error(&name.span, message, "MQTT topics of the gateway itself have this name"));
+    }
+    problems
+}
+
+fn interfaces(source: &SourceText, settings: &Settings) -> (Vec<Interface>, Vec<Diagnostic>) {
+    let mut interfaces: Vec<Interface> = Vec::new();
+    let mut problems = Vec::new();
+    for bus in settings.bus.values() {
+        let At { value, span } = &bus.interface;
+        match value.parse::<Interface>() {
+            Ok(interface) => {
+                if interfaces.contains(&interface) {
+                    let message = format!("two buses use the interface `{value}`");
+                    problems.push(source.error(span, message, "put the nodes of both under one [bus.NAME]"));
+                }
+                interfaces.push(interface);
+            }
+            Err(error) => {
+                let hint = "for example can0, virtual:demo, slcan:/dev/ttyACM0 or slcan+tcp://host:3333";
+                problems.push(source.error(span, error.to_string(), hint));
+            }
+        }
+    }
+    (interfaces, problems)
+}
+
+/// Where a mapping is looked for, beside the shipped ones.
+#[must_use]
+pub fn mapping_path(config: &str, mapping: &str) -> String {
+    let folder = config.rsplit_once('/').map_or("", |(folder, _)| folder);
+    let file = if is_path(mapping) { mapping.to_owned() } else { format!("mappings/{mapping}.toml") };
+    if file.starts_with('/') || !config.contains('/') { file } else { format!("{folder}/{file}") }
+}
+
+fn is_path(mapping: &str) -> bool {
+    mapping.contains('/') || Path::new(mapping).extension().is_some_and(|ending| ending == "toml")
+}
+
+fn mappings(
+    source: &SourceText,
+    settings: &Settings,
+    read_file: &mut dyn FnMut(&str) -> io::Result<String>,
+) -> (BTreeMap<String, SourceText>, Vec<Diagnostic>) {
+    let mut mappings = BTreeMap::new();
+    let mut problems = Vec::new();
+    for mapping in settings.node.values().map(|node| &node.mapping) {
+        if mappings.contains_key(&mapping.value) {
+            continue;
+        }
+        let path = mapping_path(&source.name, &mapping.value);
+        match read_file(&path) {
+            Ok(text) => {
+                mappings.insert(mapping.value.clone(), SourceText::new(path, text));
+            }
+            // Then it is one of those that come with the program, or `build` tells that there is none.
+            Err(error) if error.kind() == io::ErrorKind::NotFound && !is_path(&mapping.value) => {}
+            Err(error) => {
+                let message = format!("cannot read the mapping {path}: {error}");
+                problems.push(source.error(&mapping.span, message, shipped_hint()));
+                // Keeps `build` from telling the same again; an empty text would be a problem of its own.
+                if let Some((_, any)) = shipped::SHIPPED.first() {
+                    mappings.insert(mapping.value.clone(), SourceText::new(path, *any));
+                }
+            }
+        }
+    }
+    (mappings, problems)
+}
+
+fn shipped_hint() -> String {
+    let names: Vec<&str> = shipped::SHIPPED.iter().map(|(name, _)| *name).collect();
+    format!(
+        "a path is relative to this file; without `/` and `.toml` these come with the program: {}",
+        names.join(", ")
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TWO_ENGINES: &str = r#"
+version = 1
+[gateway]
+name = "hall-1"
+[bus.can0]
+interface = "virtual:demo"
+[node.engine1]
+bus = "can0"
+id = 1
+mapping = "motortech-detcon"
+[node.engine2]
+bus = "can0"
+id = 2
+mapping = "motortech-detcon"
+"#;
+
+    fn read(text: &str, files: &[(&str, &str)]) -> Result<Loaded, Vec<String>> {
+        let source = SourceText::new("etc/cangate.toml", text);
+        let mut asked = |path: &str| {
+            let found = files.iter().find(|(name, _)| *name == path);
+            found.map(|(_, text)| (*text).to_owned()).ok_or_else(|| io::ErrorKind::NotFound.into())
+        };
+        load(&source, [], &mut asked).map_err(|problems| problems.iter().map(ToString::to_string).collect())
+    }
+
+    #[test]
+    fn two_engines_on_one_bus() {
+        let loaded = read(TWO_ENGINES, &[]).unwrap();
+        assert_eq!(loaded.table.gateway, "hall-1");
+        assert_eq!(loaded.table.nodes.len(), 2);
+        assert_eq!(loaded.interfaces, [Interface::Virtual("demo".to_owned())]);
+        assert!(loaded.settings.mqtt.is_none());
+        assert_eq!(loaded.warnings, []);
+    }
+
+    #[test]
+    fn a_mapping_beside_the_configuration_goes_before_the_shipped_one() {
+        let own = crate::mapping::shipped("motortech-detcon").unwrap().replace("\"DetCon\"", "\"DetCon+\"");
+        let loaded = read(TWO_ENGINES, &[("etc/mappings/motortech-detcon.toml", &own)]).unwrap();
+        assert_eq!(loaded.table.nodes[0].device.model, "DetCon+");
+    }
+
+    #[test]
+    fn paths_of_mappings_are_relative_to_the_configuration() {
+        assert_eq!(mapping_path("/etc/cangate/cangate.toml", "x"), "/etc/cangate/mappings/x.toml");
+        assert_eq!(mapping_path("/etc/cangate/cangate.toml", "../x.toml"), "/etc/cangate/../x.toml");
+        assert_eq!(mapping_path("/etc/cangate/cangate.toml", "/srv/x"), "/srv/x");
+        assert_eq!(mapping_path("cangate.toml", "my.toml"), "my.toml");
+        assert_eq!(mapping_path("/cangate.toml", "x"), "/mappings/x.toml");
+    }
+
+    #[test]
+    fn a_mapping_that_cannot_be_read_is_told_once() {
+        let text = TWO_ENGINES.replacen("\"motortech-detcon\"", "\"./own.toml\"", 1);
+        let problems = read(&text, &[]).unwrap_err();
+        assert_eq!(problems.len(), 1, "{problems:#?}");
+        assert!(
+            problems[0]
+                .starts_with("etc/cangate.toml:10:11: error: cannot read the mapping etc/./own.toml: ")
+        );
+    }
+
+    #[test]
+    fn problems_of_all_parts_come_at_once_in_the_order_of_the_file() {
+        let text = r#"
+version = 2
+colour = "red"
+[gateway]
+name = "Hall 1"
+[bus.can0]
+interface = "serial:1"
+bit_rate = 300000
+[node.bridge]
+bus = "can1"
+id = 200
+mapping = "motortech-detcom"
+[modbus]
+max_connections = 0
+"#;
+        let problems = read(text, &[]).unwrap_err();
+        let places: Vec<&str> = problems.iter().map(|text| text.split(": error: ").next().unwrap()).collect();
+        assert_eq!(
+            places,
+            [
+                "etc/cangate.toml:2:11",
+                "etc/cangate.toml:3:1",
+                "etc/cangate.toml:5:8",
+                "etc/cangate.toml:7:13",
+                "etc/cangate.toml:8:12",
+                "etc/cangate.toml:9:7",
+                "etc/cangate.toml:10:7",
+                "etc/cangate.toml:11:6",
+                "etc/cangate.toml:12:11",
+                "etc/cangate.toml:14:19",
+            ],
+            "{problems:#?}"
+        );
+    }
+}
