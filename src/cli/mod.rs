@@ -1,4 +1,6 @@
 //! The command line: one file for each subcommand, thin.
 
+pub mod check;
 pub mod map;
+pub mod schema;
 pub mod sim;

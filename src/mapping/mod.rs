@@ -32,7 +32,7 @@ pub use at::At;
 pub use build::{Installation, build, check_mapping, is_name, sort_problems};
 pub use diagnostic::{Diagnostic, Severity, SourceText};
 pub use expression::Expression;
-pub use reader::locate;
+pub use reader::{is_mapping, locate};
 pub use shipped::shipped;
 pub use table::{
     AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, BusDef, Derived, DeviceDef, Encoding, Field, FieldKind,

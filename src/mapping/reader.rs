@@ -151,6 +151,13 @@ fn name_of(value: &DeValue<'_>) -> Option<String> {
     value.get("name")?.get_ref().as_str().map(str::to_owned)
 }
 
+/// Whether a file is meant to be a device mapping: it has a `format` or, broken as it may be, a `[device]`.
+#[must_use]
+pub fn is_mapping(source: &SourceText) -> bool {
+    let (document, _) = DeTable::parse_recoverable(&source.text);
+    ["format", "device"].into_iter().any(|key| document.get_ref().contains_key(key))
+}
+
 /// Where a key stands: its value, or as much of the path as there is; `0..0` where there is nothing of it.
 #[must_use]
 pub fn locate(source: &SourceText, path: &[&str]) -> Range<usize> {

@@ -273,7 +273,7 @@ impl Common<'_> {
             node: context.node,
             name: item.name.clone(),
             description,
-            unit: self.unit.to_owned(),
+            unit: item.element.fill(self.unit),
             decimals: decimals
                 .and_then(|decimals| u8::try_from(decimals).ok())
                 .unwrap_or(self.usual_decimals),
