@@ -26,6 +26,7 @@ fn detcon() -> TagTable {
         buses: &BTreeMap::from([(at("can0"), BusEntry::virtual_bus("can0"))]),
         nodes: &BTreeMap::from([(at("engine1"), NodeEntry::new("can0", 1, "motortech-detcon"))]),
         mappings: &BTreeMap::new(),
+        lost: &[],
     };
     build(&installation).unwrap().0
 }

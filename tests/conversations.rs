@@ -35,6 +35,7 @@ pub fn table(nodes: &[(&str, u8)], change: impl Fn(&mut BusEntry, &mut NodeEntry
         buses: &BTreeMap::from([(at("can0"), bus)]),
         nodes: &entries,
         mappings: &BTreeMap::new(),
+        lost: &[],
     };
     build(&installation).unwrap_or_else(|problems| panic!("{problems:#?}")).0
 }

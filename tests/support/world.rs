@@ -29,6 +29,7 @@ pub fn installation(count: u8) -> Arc<TagTable> {
         buses: &buses,
         nodes: &nodes,
         mappings: &BTreeMap::new(),
+        lost: &[],
     };
     Arc::new(build(&installation).unwrap_or_else(|problems| panic!("{problems:#?}")).0)
 }

@@ -70,14 +70,16 @@ pub fn of_node(
         }
     }
     list.sort();
-    for [one, other] in overlaps(&list) {
+    for mut pair in overlaps(&list) {
+        pair.sort_by_key(|claim| claim.span);
+        let [one, other] = pair;
         let span = other.span.map_or(0..0, |(start, end)| start..end);
         let message = format!(
             "{} and {} share {} {}",
             one.owner,
             other.owner,
             word(other.space),
-            other.addresses.start
+            other.addresses.start.max(one.addresses.start)
         );
         problems.error(context.source, &span, message, "give each tag addresses of its own");
     }
@@ -89,12 +91,27 @@ pub fn of_node(
     };
     list.push(own(Space::Register, 0..FIRST_REGISTER, "its node block"));
     list.push(own(Space::Bit, ALARM_BITS, "its alarm bits"));
-    let offset = context.entry.offset.as_ref().map_or(0, |offset| offset.value.min(u64::from(u16::MAX)));
+    let offset = offset(problems, context, &list);
     for claim in &mut list {
         claim.addresses.start += offset;
         claim.addresses.end += offset;
     }
     Claims { node: name.value.clone(), span: name.span.clone(), unit_id, list }
+}
+
+/// What is added to all addresses of the node, none of which may leave the address space.
+fn offset(problems: &mut Problems, context: &Context<'_>, list: &[Claim]) -> u64 {
+    let Some(offset) = &context.entry.offset else { return 0 };
+    let highest = u64::from(u16::MAX);
+    let furthest = list.iter().max_by_key(|claim| claim.addresses.end);
+    let (space, end) =
+        furthest.map_or((Space::Register, FIRST_REGISTER), |claim| (claim.space, claim.addresses.end));
+    let room = highest + 1 - end.min(highest + 1);
+    if offset.value > room {
+        let message = format!("with this offset {} {} is above {highest}", word(space), end - 1);
+        problems.error(context.config, &offset.span, message, format!("use {room} at most"));
+    }
+    offset.value.min(room)
 }
 
 /// Neighbours that overlap, of a sorted list.

@@ -11,6 +11,9 @@ use super::node::Tpdo;
 use super::problems::Problems;
 use super::tags::{Context, Kind};
 
+/// The place of a TPDO that there is not; never in a finished table.
+const NO_TPDO: usize = usize::MAX;
+
 /// The kind and width that a type's word stands for.
 fn parse(word: &str) -> Option<(FieldKind, u8)> {
     let number = |text: &str, lowest: u8| {
@@ -60,6 +63,9 @@ pub fn field(
     let number = section.tpdo.value;
     let pdo = context.tpdos.iter().position(|tpdo| tpdo.number == number);
     match pdo.and_then(|place| context.tpdos.get(place)).map(|tpdo| tpdo.section) {
+        // A TPDO whose entry is wrong has been told already.
+        None if context.items.is_lost(&number.to_string()) || context.tpdos.iter().any(Tpdo::is_misnamed) => {
+        }
         None => {
             let known: Vec<&str> = context.tpdos.iter().map(|tpdo| tpdo.key.value.as_str()).collect();
             let hint = if known.is_empty() {
@@ -90,7 +96,7 @@ pub fn field(
         invert: section.invert,
     };
     check_byte_order(problems, source, &section.bit.span, &item.name, field);
-    (pdo.unwrap_or_default(), field)
+    (pdo.unwrap_or(NO_TPDO), field)
 }
 
 /// Only whole bytes can be turned round.
@@ -112,6 +118,7 @@ pub fn check_byte_order(
 pub fn check_overlaps(problems: &mut Problems, context: &Context<'_>, fields: &[(usize, usize, Field)]) {
     let mut used: Vec<(usize, Range<u16>, usize)> = fields
         .iter()
+        .filter(|(_, pdo, _)| *pdo != NO_TPDO)
         .map(|(item, pdo, field)| {
             let first = u16::from(field.bit);
             (*pdo, first..first + u16::from(field.width), *item)

@@ -105,7 +105,8 @@ pub struct Items<'a> {
     /// They.
     pub list: Vec<Item<'a>>,
     by_name: BTreeMap<String, usize>,
-    lost: &'a [String],
+    /// Names of entries that could not be read or unrolled.
+    lost: Vec<String>,
 }
 
 impl<'a> Items<'a> {
@@ -116,7 +117,7 @@ impl<'a> Items<'a> {
         file: &'a MappingFile,
         lost: &'a [String],
     ) -> Self {
-        let mut items = Self { list: Vec::new(), by_name: BTreeMap::new(), lost };
+        let mut items = Self { list: Vec::new(), by_name: BTreeMap::new(), lost: lost.to_vec() };
         let parameters =
             file.parameter.iter().map(|section| (&section.name, None, Entry::Parameter(section)));
         let tags =
@@ -126,7 +127,11 @@ impl<'a> Items<'a> {
             .iter()
             .map(|section| (&section.name, section.array.as_ref(), Entry::Derived(section)));
         for (name, array, entry) in parameters.chain(tags).chain(derived) {
-            for element in elements(problems, source, name, array) {
+            let elements = elements(problems, source, name, array);
+            if elements.is_empty() {
+                items.lost.push(name.value.clone());
+            }
+            for element in elements {
                 items.add(problems, source, name, element, entry);
             }
             if items.list.len() > MOST_TAGS {
@@ -182,7 +187,7 @@ impl<'a> Items<'a> {
     }
 
     /// Whether a name belongs to an entry that could not be read.
-    fn is_lost(&self, name: &str) -> bool {
+    pub fn is_lost(&self, name: &str) -> bool {
         self.lost.iter().any(|lost| match lost.split_once("{}") {
             Some((before, after)) => name.starts_with(before) && name.ends_with(after),
             None => lost == name,

@@ -188,13 +188,12 @@ impl Builder<'_> {
         let bus = self.bus(problems, entry);
         let id = problems.within(config, &entry.id, "node id", 1..=127);
         let id = u8::try_from(id).ok().and_then(NodeId::new);
-        if let Some(bus) = bus {
+        if let (Some(bus), true) = (bus, (1..=127).contains(&entry.id.value)) {
             self.taken.node_id(problems, self.installation, name, entry, bus);
+        } else {
+            self.taken.ignore(name);
         }
         let unit_id = self.unit_id(problems, entry);
-        if let Some(offset) = &entry.offset {
-            problems.within(config, offset, "offset", 0..=65_335);
-        }
         let Some(mapping) = files.get(&entry.mapping.value) else {
             let mapping = &entry.mapping;
             let message = format!("there is no mapping `{}`", mapping.value);

@@ -25,8 +25,8 @@ const RESTRICTED: [(u32, u32, &str); 7] = [
 pub struct Taken {
     node_ids: BTreeMap<(BusIndex, u64), String>,
     identifiers: BTreeMap<(BusIndex, CanId), String>,
-    /// Nodes whose id is another's too: they share all identifiers, which needs no telling.
-    duplicates: BTreeSet<String>,
+    /// Nodes whose bus or id is wrong: what follows from that for their identifiers needs no telling.
+    ignored: BTreeSet<String>,
 }
 
 impl Taken {
@@ -47,13 +47,18 @@ impl Taken {
                 name.value, id.value, entry.bus.value
             );
             problems.error(installation.config, &id.span, message, hint);
-            self.duplicates.insert(name.value.clone());
+            self.ignore(name);
         }
         let own = installation.buses.values().nth(bus.0).and_then(|bus| bus.own_node_id.as_ref());
         if own.is_some_and(|own| own.value == id.value) {
             let message = format!("node id {} is the gateway's own on bus `{}`", id.value, entry.bus.value);
             problems.error(installation.config, &id.span, message, hint);
         }
+    }
+
+    /// A node whose identifiers are not to be looked at.
+    pub fn ignore(&mut self, name: &At<String>) {
+        self.ignored.insert(name.value.clone());
     }
 
     /// An identifier must have one sender on its bus.
@@ -79,10 +84,10 @@ impl Taken {
         }
         for (what, id) in all {
             let owner = format!("{what} of node `{}`", name.value);
-            let Some(other) = self.identifiers.insert((bus, id), owner.clone()) else { continue };
-            if self.duplicates.contains(&name.value) {
+            if self.ignored.contains(&name.value) {
                 continue;
             }
+            let Some(other) = self.identifiers.insert((bus, id), owner.clone()) else { continue };
             let message = format!("{other} and {owner} have the same identifier {id}");
             problems.error(
                 config,

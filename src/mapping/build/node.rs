@@ -188,6 +188,11 @@ impl<'a> Tpdo<'a> {
         all
     }
 
+    /// Whether its number is none.
+    pub fn is_misnamed(&self) -> bool {
+        self.number == u64::MAX
+    }
+
     /// Its reserved bits as a mask.
     pub fn reserved_bits(&self) -> u64 {
         let bits = self.section.reserved_bits.iter().flat_map(|bits| {

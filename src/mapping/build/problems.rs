@@ -114,15 +114,19 @@ impl Problems {
     }
 }
 
-/// By file and place, each once: two nodes with the same mapping find the same problems in it.
+/// By file and place. Of those at one place that differ in numbers only, the first: elements of an array, or two nodes with
+/// the same mapping, have the same problem.
 #[must_use]
 pub fn sort_problems(mut problems: Vec<Diagnostic>) -> Vec<Diagnostic> {
-    let key = |problem: &Diagnostic| (problem.file.clone(), problem.line, problem.column);
-    problems.sort_by_key(key);
+    let place = |problem: &Diagnostic| (problem.file.clone(), problem.line, problem.column);
+    let gist = |problem: &Diagnostic| -> String {
+        problem.message.chars().filter(|letter| !letter.is_ascii_digit()).collect()
+    };
+    problems.sort_by_key(place);
     let mut unique: Vec<Diagnostic> = Vec::new();
     for problem in problems {
-        let place = key(&problem);
-        if !unique.iter().rev().take_while(|known| key(known) == place).any(|known| *known == problem) {
+        let here = unique.iter().rev().take_while(|known| place(known) == place(&problem));
+        if !here.into_iter().any(|known| gist(known) == gist(&problem)) {
             unique.push(problem);
         }
     }

@@ -374,7 +374,7 @@ fn encoding(word: EncodingWord) -> Encoding {
     }
 }
 
-/// The address of an element of an array, if it and the offset of the node stay below 65536.
+/// The address of an element of an array, if it stays below 65536.
 fn address_of(
     problems: &mut Problems,
     context: &Context<'_>,
@@ -388,12 +388,6 @@ fn address_of(
         let message = format!("address {last} of `{}` is above 65535", item.name);
         problems.error(context.source, &address.span, message, "use a lower address");
         return None;
-    }
-    if let Some(offset) = &context.entry.offset
-        && last.saturating_add(offset.value) > u64::from(u16::MAX)
-    {
-        let message = format!("with this offset address {last} of `{}` is above 65535", item.name);
-        problems.error(context.config, &offset.span, message, "use a smaller offset");
     }
     u16::try_from(first).ok()
 }
