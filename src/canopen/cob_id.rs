@@ -52,3 +52,14 @@ pub fn emcy(node: NodeId) -> CanId {
 pub fn error_control(node: NodeId) -> CanId {
     CanId::Standard(0x700 + u16::from(node.get()))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn r_det_005_node_ids_are_1_to_127() {
+        let valid: Vec<u8> = (0..=255).filter(|id| NodeId::new(*id).is_some()).collect();
+        assert_eq!(valid, (1..=127).collect::<Vec<u8>>());
+    }
+}

@@ -1,6 +1,7 @@
 //! Node guarding of one node (CiA 301, R-DET-021..046): when to ask, and what an answer is worth.
 //!
-//! Requests stand on a grid of the guard time; of one node there is never more than one open. A reply that is missed or
+//! Requests stand on a grid of the guard time, a different one for each node, but for those that have a reason to come
+//! sooner; of one node there is never more than one open. A reply that is missed or
 //! carries the wrong toggle bit is a failure; `life_time_factor` failures in a row lose the node. Only a valid reply or a
 //! boot-up message ends the loss; guarding goes on meanwhile.
 
@@ -18,8 +19,12 @@ pub(super) struct Guarding {
     settings: GuardingSettings,
     /// Wait between "start asking" and the first request, different for each node so that requests do not burst.
     phase: Duration,
-    /// When the next request stands on the grid; `None` while the bus cannot be used.
+    /// A point of the grid that the requests stand on.
+    grid: Instant,
+    /// When the next request is due; `None` while the bus cannot be used.
     due: Option<Instant>,
+    /// The next request is the one after a boot-up message; the one after it keeps its distance from that.
+    after_boot_up: bool,
     /// End of the pause after an NMT command.
     settled: Option<Instant>,
     open: Option<Request>,
@@ -94,7 +99,9 @@ impl Guarding {
         Self {
             settings,
             phase,
+            grid: now + phase,
             due: Some(now + phase),
+            after_boot_up: false,
             settled: None,
             open: None,
             missed: None,
@@ -164,10 +171,12 @@ impl Guarding {
         (std::mem::take(&mut self.lost), self.open.is_some())
     }
 
-    /// It was a boot-up message: asks soon, and from then on with the guard time.
+    /// It was a boot-up message: asks soon, again after the guard time, and then on the grid, so that the nodes of a bus
+    /// that were switched on together are not asked together for good.
     pub(super) fn ask_after_boot_up(&mut self, now: Instant) {
         if self.due.is_some() {
             self.due = Some(now + AFTER_BOOT_UP.min(self.settings.guard_time));
+            self.after_boot_up = true;
         }
     }
 
@@ -213,7 +222,9 @@ impl Guarding {
 
     /// The bus can be used again: as at the start.
     pub(super) fn resume(&mut self, now: Instant) {
-        self.due = Some(now + self.phase);
+        self.grid = now + self.phase;
+        self.due = Some(self.grid);
+        self.after_boot_up = false;
     }
 
     /// Closes a request whose deadline lies before `now`, for a frame that was received at `now`.
@@ -228,7 +239,9 @@ impl Guarding {
         let missed = if overdue { self.close() } else { None };
         let request = self.open.is_none() && self.send_at().is_some_and(|at| at <= now);
         if request {
-            self.due = self.due.map(|due| next_on_grid(due, self.settings.guard_time, now));
+            let period = self.settings.guard_time;
+            let booted = std::mem::take(&mut self.after_boot_up);
+            self.due = Some(if booted { now + period } else { next_on_grid(self.grid, period, now) });
             self.settled = None;
             self.answered = None;
             self.open = Some(Request { deadline: now + self.settings.reply_timeout, excused: false });
@@ -276,12 +289,12 @@ impl Guarding {
     }
 }
 
-/// The first instant of the grid `due + k * period` after `now`, k at least 1: what was slept through is not made up for.
-fn next_on_grid(due: Instant, period: Duration, now: Instant) -> Instant {
+/// The first instant of the grid `grid + k * period` after `now`, k at least 1: what was slept through is not made up for.
+fn next_on_grid(grid: Instant, period: Duration, now: Instant) -> Instant {
     let period = u64::try_from(period.as_micros()).unwrap_or(u64::MAX).max(1);
-    let passed = now.as_micros().saturating_sub(due.as_micros()) / period;
+    let passed = now.as_micros().saturating_sub(grid.as_micros()) / period;
     let ahead = passed.saturating_add(1).saturating_mul(period);
-    Instant::from_micros(due.as_micros().saturating_add(ahead))
+    Instant::from_micros(grid.as_micros().saturating_add(ahead))
 }
 
 #[cfg(test)]
@@ -374,6 +387,18 @@ mod tests {
             Some((at(8000), "guard request")),
             "what was slept through is let go"
         );
+    }
+
+    #[test]
+    fn after_a_boot_up_the_node_is_asked_soon_then_after_the_guard_time_and_then_on_its_grid() {
+        let mut guarding = answered();
+        guarding.handle_zero();
+        guarding.ask_after_boot_up(at(200));
+        for (request, toggle) in [(300, false), (800, true), (1000, false), (1500, true)] {
+            assert_eq!(guarding.poll_timeout(), Some((at(request), "guard request")));
+            guarding.handle_timeout(at(request));
+            assert_eq!(guarding.handle_reply(at(request + 1), toggle), VALID);
+        }
     }
 
     #[test]

@@ -243,7 +243,7 @@ fn r_det_083_a_tpdo_of_a_stopped_node_is_decoded_and_the_node_is_asked_at_once()
         NodeSettings { start: StartSettings { auto_start: false, ..StartSettings::default() }, ..detcon(1) };
     let mut bench = Bench::new(master(vec![settings]));
     bench.frame(0, "701#04").take();
-    bench.frame(200, "181#0000000000000000").frame(210, "701#85").run(799);
+    bench.frame(200, "181#0000000000000000").frame(210, "701#85").run(599);
     assert_eq!(
         bench.take(),
         [
@@ -251,7 +251,7 @@ fn r_det_083_a_tpdo_of_a_stopped_node_is_decoded_and_the_node_is_asked_at_once()
             "200 State { from: Some(Stopped), to: Operational, ordered: false }",
             "200 Pdo { pdo: PdoIndex(0), data: [0, 0, 0, 0, 0, 0, 0, 0], length: 8 }",
             "200 701#R1",
-            "700 701#R1",
+            "500 701#R1",
         ]
     );
 }

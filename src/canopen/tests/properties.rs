@@ -121,7 +121,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(500))]
 
     #[test]
-    fn r_det_016_only_starts_and_guard_requests_leave_and_nothing_at_all_in_the_passive_role(
+    fn r_det_002_016_and_090_only_starts_and_guard_requests_leave_and_nothing_in_the_passive_role(
         settings in any_network(),
         steps in prop::collection::vec(any_step(), 1..200),
     ) {

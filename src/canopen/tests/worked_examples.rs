@@ -9,37 +9,38 @@ fn with_guarding(change: impl FnOnce(&mut GuardingSettings)) -> NodeSettings {
     NodeSettings { error_control: ErrorControl::Guarding(guarding), ..mute() }
 }
 
+/// The gateway has been asking for 400 ms when the device boots: 400 ms are to be taken off to get the example's times.
 #[test]
-fn v_det_02_power_up_guarding_start_stop() {
+fn v_det_02_r_det_021_to_028_power_up_guarding_start_stop() {
     let mut bench = Bench::new(master(vec![mute()]));
-    bench.frame(0, "701#00").run(100).frame(101, "701#7F").run(600).frame(601, "701#85");
-    bench.run(1100).frame(1101, "701#05");
-    assert!(bench.request(1200, 1, NmtRequest::Stop));
-    bench.run(1600).frame(1601, "701#84").run(2100).frame(2101, "701#04").run(2200);
+    bench.run(399).take();
+    bench.frame(400, "701#00").run(500).frame(501, "701#7F").run(1000).frame(1001, "701#85");
+    bench.run(1500).frame(1501, "701#05");
+    assert!(bench.request(1600, 1, NmtRequest::Stop));
+    bench.run(2000).frame(2001, "701#84").run(2500).frame(2501, "701#04").run(2600);
     assert_eq!(
         bench.take(),
         [
-            "0 701#R1",
-            "0 Seen",
-            "0 State { from: None, to: Initialising, ordered: true }",
-            "100 701#R1",
-            "101 State { from: Some(Initialising), to: PreOperational, ordered: true }",
-            "101 000#0101",
-            "101 NmtSent { request: Start }",
-            "600 701#R1",
-            "601 State { from: Some(PreOperational), to: Operational, ordered: true }",
-            "1100 701#R1",
-            "1200 000#0201",
-            "1200 NmtSent { request: Stop }",
-            "1600 701#R1",
-            "1601 State { from: Some(Operational), to: Stopped, ordered: true }",
-            "2100 701#R1",
+            "400 Seen",
+            "400 State { from: None, to: Initialising, ordered: true }",
+            "500 701#R1",
+            "501 State { from: Some(Initialising), to: PreOperational, ordered: true }",
+            "501 000#0101",
+            "501 NmtSent { request: Start }",
+            "1000 701#R1",
+            "1001 State { from: Some(PreOperational), to: Operational, ordered: true }",
+            "1500 701#R1",
+            "1600 000#0201",
+            "1600 NmtSent { request: Stop }",
+            "2000 701#R1",
+            "2001 State { from: Some(Operational), to: Stopped, ordered: true }",
+            "2500 701#R1",
         ]
     );
 }
 
 #[test]
-fn v_det_03_all_guarding_data_bytes() {
+fn v_det_03_r_det_023_all_guarding_data_bytes() {
     for byte in 0..=255_u8 {
         let mut bench = Bench::new(master(vec![mute()]));
         bench.frame(0, &format!("701#{byte:02X}"));
@@ -194,6 +195,26 @@ fn v_det_15_boot_up_in_the_middle_of_operation() {
 }
 
 #[test]
+fn v_det_16_highest_node_id() {
+    let mut bench = Bench::new(master(vec![detcon(127)]));
+    bench.frames(&[(0, "77F#00"), (101, "77F#7F"), (200, "4FF#FF0000010F00")]);
+    assert_eq!(
+        bench.take(),
+        [
+            "0 77F#R1",
+            "0 Seen",
+            "0 State { from: None, to: Initialising, ordered: true }",
+            "100 77F#R1",
+            "101 State { from: Some(Initialising), to: PreOperational, ordered: true }",
+            "101 000#017F",
+            "101 NmtSent { request: Start }",
+            "200 State { from: Some(PreOperational), to: Operational, ordered: true }",
+            "200 Pdo { pdo: PdoIndex(3), data: [255, 0, 0, 1, 15, 0, 0, 0], length: 6 }",
+        ]
+    );
+}
+
+#[test]
 fn v_det_17_r_det_006_and_042_frames_that_must_not_be_decoded() {
     let mut bench = running();
     bench.frames(&[
@@ -279,7 +300,7 @@ fn r_det_035_a_toggle_error_does_not_update_the_state() {
 fn r_det_029_and_040_replies_with_state_0_are_no_protocol_error() {
     let mut bench = Bench::new(master(vec![mute()]));
     bench.frame(0, "701#00").run(100).frame(101, "701#00").run(600).frame(601, "701#80");
-    bench.run(1100).frame(1101, "701#7F");
+    bench.run(1000).frame(1001, "701#7F");
     let told = bench.take();
     assert!(told.iter().all(|line| !line.contains("Error") && !line.contains("Restarted")), "{told:?}");
     assert!(told.iter().all(|line| !line.contains("Missed")), "{told:?}");
