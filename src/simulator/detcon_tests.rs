@@ -49,7 +49,7 @@ fn v_det_02_power_up_guarding_start_stop() {
 }
 
 #[test]
-fn v_det_01_r_det_007_to_010_start_and_stop_addressed_and_broadcast() {
+fn v_det_01_r_det_007_008_009_010_start_and_stop_addressed_and_broadcast() {
     for (start, stop) in [("000#0101", "000#0201"), ("000#0100", "000#0200"), ("000#0100", "000#0201")] {
         let mut bench = Bench::powered(healthy());
         bench.frame(100, start);
@@ -138,7 +138,7 @@ fn r_det_016_pre_operational_and_resets_work_unless_switched_off() {
 }
 
 #[test]
-fn r_det_022_to_024_each_request_gets_one_byte_with_state_and_alternating_toggle() {
+fn r_det_022_023_024_each_request_gets_one_byte_with_state_and_alternating_toggle() {
     let mut bench = Bench::operational(in_phase(), 100);
     bench.take();
     for (turn, expected) in ["05", "85", "05", "85"].into_iter().enumerate() {
@@ -295,7 +295,7 @@ fn v_det_18(restart: bool) -> Vec<(u64, String)> {
 }
 
 #[test]
-fn v_det_18_r_det_070_to_075_event_and_inhibit_with_timer_restart() {
+fn v_det_18_r_det_070_071_072_075_event_and_inhibit_with_timer_restart() {
     let expected = sent(&[(0, "00100000"), (100, "01200000"), (250, "00200000"), (750, "00200100")]);
     assert_eq!(v_det_18(true), expected);
 }
