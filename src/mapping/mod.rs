@@ -3,13 +3,15 @@
 //! Reads text, opens no file. From the mapping files and the installation's buses and nodes it makes one checked,
 //! resolved, immutable [`TagTable`], or a list of [`Diagnostic`]s, all at once, each with file, line, column and hint.
 //!
-//! - `file`: the TOML form of a mapping, as `mappings/README.md` teaches it.
+//! - [`file`], [`file_values`]: the TOML form of a mapping, as `mappings/README.md` teaches it. [`shipped`](mod@shipped): those
+//!   that come with the program.
 //! - [`installation`]: the `[bus.*]` and `[node.*]` tables of the configuration.
-//! - `build`: from both to the tag table; `check`: what must hold.
+//! - [`build`](mod@build): from both to the tag table, or to everything that is wrong.
+//! - [`builtin`]: the alarms that every gateway, bus and node has.
 //! - [`table`]: the result.
-//! - [`expression`]: conditions on tags; `expression_parser` reads them.
-//! - `codec`: raw bits to values.
-//! - [`diagnostic`]: messages about files. `reader`: strict TOML; `suggest`: "did you mean".
+//! - [`expression`]: conditions on tags; [`expression_parser`] reads them.
+//! - [`codec`]: raw bits to values, values to registers.
+//! - [`diagnostic`]: messages about files. [`reader`]: strict TOML; [`At`]: a value and its place; [`suggest`]: "did you mean".
 
 mod at;
 pub mod build;

@@ -125,14 +125,18 @@ pub fn check_overlaps(problems: &mut Problems, context: &Context<'_>, fields: &[
         })
         .collect();
     used.sort_by_key(|(pdo, bits, item)| (*pdo, bits.start, *item));
-    for pair in used.windows(2) {
-        let [(pdo, bits, item), (next_pdo, next_bits, next_item)] = pair else { continue };
-        if pdo == next_pdo
-            && next_bits.start < bits.end
-            && let (Some(one), Some(other)) = (context.items.get(*item), context.items.get(*next_item))
+    let mut furthest: Option<&(usize, Range<u16>, usize)> = None;
+    for next in &used {
+        let before = furthest.filter(|(pdo, _, _)| *pdo == next.0);
+        if let Some((_, bits, item)) = before
+            && next.1.start < bits.end
+            && let (Some(one), Some(other)) = (context.items.get(*item), context.items.get(next.2))
         {
-            let message = format!("`{}` and `{}` share bit {}", one.name, other.name, next_bits.start);
+            let message = format!("`{}` and `{}` share bit {}", one.name, other.name, next.1.start);
             problems.warning(context.source, &other.span, message, "check `bit` and `type` of both");
+        }
+        if before.is_none_or(|(_, bits, _)| bits.end < next.1.end) {
+            furthest = Some(next);
         }
     }
     for (pdo, bits, item) in &used {
