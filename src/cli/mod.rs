@@ -1,6 +1,5 @@
 //! The command line: one file for each subcommand, thin.
 
 pub mod check;
-pub mod map;
 pub mod schema;
 pub mod sim;
