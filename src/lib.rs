@@ -70,5 +70,6 @@ pub mod mqtt;
 pub mod process_image;
 pub mod simulator;
 pub mod supervisor;
+pub mod telemetry;
 pub mod time;
 pub mod web;

@@ -1,3 +1,7 @@
 //! The program: parse the arguments, run, exit code.
 
-fn main() {}
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    cangate::cli::main()
+}

@@ -6,9 +6,9 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use cangate::cli::map::{MapFormat, diff, render};
 use cangate::mapping::installation::{BusEntry, NodeEntry};
 use cangate::mapping::{At, Installation, SourceText, TagTable, build};
+use cangate::modbus::map_text::{MapFormat, diff, render};
 use cangate::modbus::{MapDocument, ModbusSettings, RegisterMap};
 
 fn fixture(name: &str) -> String {

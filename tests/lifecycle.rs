@@ -1,1 +1,245 @@
-//! (none yet)
+//! The program as a process: exit codes, start without the outside world, stop, demo.
+
+use std::io::{BufRead, BufReader, Read};
+use std::net::{SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use tokio_modbus::client::{Context, Reader, tcp};
+use tokio_modbus::slave::Slave;
+
+use crate::support::until;
+
+/// The program under test.
+fn cangate() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cangate"));
+    command.env_remove("CANGATE_LOG").stdin(Stdio::null());
+    command
+}
+
+fn run(arguments: &[&str]) -> Output {
+    cangate().args(arguments).output().unwrap()
+}
+
+/// A process that does not outlive its test.
+struct Running(Child);
+
+impl Running {
+    fn start(command: &mut Command) -> Self {
+        Self(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap())
+    }
+
+    fn signal(&self, signal: Signal) {
+        kill(Pid::from_raw(self.0.id().try_into().unwrap()), signal).unwrap();
+    }
+
+    /// Its exit code and what it said.
+    fn wait(mut self) -> (Option<i32>, String) {
+        let status = self.0.wait().unwrap();
+        let mut said = String::new();
+        self.0.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+        (status.code(), said)
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// An address that nobody listens on now.
+fn free_address() -> SocketAddr {
+    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
+}
+
+fn configuration(folder: &Path, bus: &str, modbus: SocketAddr, http: SocketAddr) -> PathBuf {
+    let file = folder.join("cangate.toml");
+    let text = format!(
+        "version = 1\n[gateway]\nname = \"test\"\n[bus.can0]\ninterface = \"{bus}\"\n\
+         [node.engine1]\nbus = \"can0\"\nid = 1\nmapping = \"motortech-detcon\"\n\
+         [modbus]\nlisten = [\"{modbus}\"]\n[http]\nlisten = \"{http}\"\n\
+         [mqtt]\nurl = \"mqtt://127.0.0.1:1\"\n"
+    );
+    std::fs::write(&file, text).unwrap();
+    file
+}
+
+/// A Modbus client to a unit, once somebody listens.
+async fn connect(address: SocketAddr, unit: u8) -> Context {
+    until("the Modbus server listens", async || tcp::connect_slave(address, Slave(unit)).await.ok()).await
+}
+
+#[test]
+fn a_wrong_command_line_exits_with_64() {
+    for arguments in
+        [&["rnu"][..], &["run", "--nonsense"], &["sim", "detcon", "-i", "can0", "--node", "128"], &[]]
+    {
+        let output = run(arguments);
+        assert_eq!(output.status.code(), Some(64), "{arguments:?}");
+        assert!(!output.stderr.is_empty());
+    }
+}
+
+#[test]
+fn help_and_version_exit_with_0() {
+    for arguments in [&["--help"][..], &["--version"], &["run", "--help"]] {
+        assert_eq!(run(arguments).status.code(), Some(0), "{arguments:?}");
+    }
+}
+
+#[test]
+fn a_wrong_configuration_exits_with_78_and_says_where() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("cangate.toml");
+    std::fs::write(&file, "version = 1\n[gateway]\nname = \"x\"\n[bus.can0]\ninterfase = \"can0\"\n")
+        .unwrap();
+    let file = file.to_str().unwrap();
+    for arguments in [&["run", "-c", file][..], &["check", file], &["map", "-c", file]] {
+        let output = run(arguments);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(78), "{arguments:?}: {said}");
+        assert!(said.contains(&format!("{file}:5:1")), "{said}");
+        assert!(said.contains("hint"), "{said}");
+    }
+}
+
+#[test]
+fn a_missing_file_exits_with_74_and_names_it() {
+    let output = run(&["run", "-c", "/nowhere/cangate.toml"]);
+    assert_eq!(output.status.code(), Some(74));
+    assert!(String::from_utf8(output.stderr).unwrap().contains("/nowhere/cangate.toml"));
+}
+
+#[test]
+fn a_taken_port_exits_with_74_and_names_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let file = configuration(folder.path(), "virtual:taken", taken.local_addr().unwrap(), free_address());
+    let output = run(&["run", "-c", file.to_str().unwrap()]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(74), "{said}");
+    assert!(said.contains(&taken.local_addr().unwrap().to_string()), "{said}");
+}
+
+#[tokio::test]
+async fn without_can_and_without_a_broker_modbus_answers_with_invalid_values_and_sigterm_ends_it_with_0() {
+    let folder = tempfile::tempdir().unwrap();
+    let (modbus, http) = (free_address(), free_address());
+    let file = configuration(folder.path(), "cgtest-none", modbus, http);
+    let gateway = Running::start(cangate().args(["run", "-c", file.to_str().unwrap()]));
+    let mut client = connect(modbus, 1).await;
+    assert_eq!(client.read_input_registers(100, 2).await.unwrap().unwrap(), [0xFFFF, 0xFFFF]);
+    let node = client.read_input_registers(0, 4).await.unwrap().unwrap();
+    assert_eq!(
+        (node[1] & 1, node[2], node[3]),
+        (0, 0xFFFF, 65535),
+        "not online, state unknown, never received"
+    );
+    gateway.signal(Signal::SIGTERM);
+    let (code, said) = tokio::task::spawn_blocking(move || gateway.wait()).await.unwrap();
+    assert_eq!(code, Some(0), "{said}");
+}
+
+#[tokio::test]
+async fn the_demo_shows_values_and_prints_what_to_connect_where() {
+    let (modbus, mqtt, http) = (free_address(), free_address(), free_address());
+    let [modbus_text, mqtt_text, http_text] = [modbus, mqtt, http].map(|address| address.to_string());
+    let arguments = ["demo", "--modbus", &modbus_text, "--mqtt", &mqtt_text, "--http", &http_text];
+    let mut demo = Running::start(cangate().args(arguments));
+    let mut lines = BufReader::new(demo.0.stdout.take().unwrap()).lines();
+    let said: Vec<String> =
+        tokio::task::spawn_blocking(move || lines.by_ref().map_while(Result::ok).take(8).collect())
+            .await
+            .unwrap();
+    let said = said.join("\n");
+    for part in [
+        "mbpoll",
+        &modbus.port().to_string(),
+        "mosquitto_sub",
+        &mqtt.port().to_string(),
+        &format!("http://{http}/"),
+    ] {
+        assert!(said.contains(part), "`{part}` is missing in:\n{said}");
+    }
+    let mut client = connect(modbus, 1).await;
+    let value = until("engine 1 has a knock intensity", async || {
+        let registers = client.read_input_registers(100, 20).await.ok()?.ok()?;
+        registers.iter().all(|register| *register <= 10_000).then_some(registers)
+    });
+    assert_eq!(value.await.len(), 20);
+    demo.signal(Signal::SIGINT);
+    let (code, said) = tokio::task::spawn_blocking(move || demo.wait()).await.unwrap();
+    assert_eq!(code, Some(0), "{said}");
+}
+
+#[test]
+fn check_accepts_what_is_shipped() {
+    let mappings = Path::new(env!("CARGO_MANIFEST_DIR")).join("mappings");
+    let mut files = 0;
+    for entry in std::fs::read_dir(mappings).unwrap() {
+        let file = entry.unwrap().path();
+        if file.extension().is_some_and(|extension| extension == "toml") {
+            files += 1;
+            let output = run(&["check", file.to_str().unwrap()]);
+            assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+            assert!(
+                output.stderr.is_empty(),
+                "a shipped file has a warning: {}",
+                String::from_utf8_lossy(&output.stderr)
+            );
+        }
+    }
+    assert!(files > 0);
+}
+
+#[test]
+fn map_writes_json_that_diff_finds_equal_and_a_moved_address_exits_with_1() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = configuration(folder.path(), "can0", free_address(), free_address());
+    let file = file.to_str().unwrap();
+    let (old, new) = (folder.path().join("old.json"), folder.path().join("new.json"));
+    let (old, new) = (old.to_str().unwrap(), new.to_str().unwrap());
+    assert_eq!(run(&["map", "-c", file, "--format", "json", "-o", old]).status.code(), Some(0));
+    assert_eq!(run(&["map", "diff", old, old]).status.code(), Some(0));
+    let text = std::fs::read_to_string(old).unwrap();
+    let map: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let point =
+        map["points"].as_array().unwrap().iter().find(|point| point["tag"] == "knock_intensity_1").unwrap();
+    assert_eq!((point["address"].as_u64(), point["reference"].as_str()), (Some(100), Some("300101")));
+    let moved = std::fs::read_to_string(file).unwrap().replace("id = 1\n", "id = 1\noffset = 300\n");
+    std::fs::write(file, moved).unwrap();
+    assert_eq!(run(&["map", "-c", file, "--format", "json", "-o", new]).status.code(), Some(0));
+    let diff = run(&["map", "diff", old, new]);
+    assert_eq!(diff.status.code(), Some(1));
+    assert!(String::from_utf8(diff.stdout).unwrap().contains("knock_intensity_1"));
+}
+
+#[test]
+fn schemas_are_json_and_completions_are_not_empty() {
+    for of in ["config", "mapping"] {
+        let schema: serde_json::Value = serde_json::from_slice(&run(&["schema", of]).stdout).unwrap();
+        assert!(schema["$schema"].is_string(), "{of}");
+    }
+    for shell in ["bash", "zsh", "fish"] {
+        assert!(run(&["completions", shell]).stdout.len() > 1_000, "{shell}");
+    }
+}
+
+#[test]
+fn replay_gives_the_same_output_every_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = configuration(folder.path(), "can0", free_address(), free_address());
+    let log = folder.path().join("bus.log");
+    let text = "(1763760000.000000) can0 701#05\n(1763760000.100000) can0 181#00FF80017FFE3340\n(1763760000.200000) can0 381#02800F0F000099CC\n";
+    std::fs::write(&log, text).unwrap();
+    let replay = || run(&["replay", log.to_str().unwrap(), "-c", file.to_str().unwrap()]);
+    let (first, second) = (replay(), replay());
+    assert_eq!(first.status.code(), Some(0), "{}", String::from_utf8_lossy(&first.stderr));
+    assert_eq!(first.stdout, second.stdout);
+    let said = String::from_utf8(first.stdout).unwrap();
+    assert!(said.contains("knock_intensity_2") && said.contains("trip"), "{said}");
+}

@@ -14,13 +14,16 @@
 //! | `web_server` | health, metrics, page |
 //! | `lifecycle` | the program as a process: start, stop, exit codes |
 //! | `properties` | random input: no panic, no torn value |
+//! | `requirements` | every requirement has a test whose name cites it, or a reason |
 //!
 //! Tests on a real CAN bus are in `tests/vcan`, those of the container in `tests/container`.
 
 #![allow(
     clippy::allow_attributes,
     clippy::as_conversions,
+    clippy::doc_markdown,
     clippy::expect_used,
+    clippy::float_cmp,
     clippy::indexing_slicing,
     clippy::panic,
     clippy::print_stderr,
@@ -43,5 +46,6 @@ mod modbus_server;
 mod mqtt_client;
 mod mqtt_publisher;
 mod properties;
+mod requirements;
 mod support;
 mod web_server;

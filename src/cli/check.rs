@@ -3,6 +3,9 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use super::Exit;
+use super::args::CheckArguments;
+use super::output::{print_line, print_text};
 use crate::config;
 use crate::mapping::{Diagnostic, Severity, SourceText, check_mapping, is_mapping};
 
@@ -41,6 +44,18 @@ impl fmt::Display for Report {
             _ => write!(f, "{files} checked: {}, {}", counted(errors, "error"), counted(warnings, "warning")),
         }
     }
+}
+
+/// Prints the report: on standard output when all is well, on standard error when not.
+pub(super) fn run(arguments: &CheckArguments) -> Exit {
+    let variables: Vec<(String, String)> = std::env::vars().collect();
+    let report = check(&arguments.files, &variables);
+    if report.problems.is_empty() {
+        print_line(&report.to_string());
+    } else {
+        print_text(&report.to_string());
+    }
+    if report.has_errors() { Exit::Configuration } else { Exit::Ok }
 }
 
 /// Checks configuration files (with the mappings that they use, and the environment's `CANGATE__` variables over them) and

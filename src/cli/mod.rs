@@ -1,5 +1,119 @@
-//! The command line: one file for each subcommand, thin.
+//! The command line: one file for each subcommand, thin. \[IO\]
+//!
+//! Exit codes: 0 ok, 1 a comparison found a difference, 64 usage, 70 our bug, 74 IO at start, 78 configuration.
 
+mod args;
 pub mod check;
+mod completions;
+mod demo;
+mod load;
+mod map;
+mod output;
+mod replay;
+mod run;
 pub mod schema;
 pub mod sim;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+pub use args::{CommandLine, Subcommand};
+use output::print_error;
+
+/// How a command ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Exit {
+    /// 0: as asked.
+    Ok,
+    /// 1: a comparison found a difference.
+    Different,
+    /// 64: the command line is wrong.
+    Usage,
+    /// 70: a bug of ours.
+    Bug,
+    /// 74: something outside could not be used at start: a port is taken, a file cannot be read.
+    Io,
+    /// 78: the configuration is wrong.
+    Configuration,
+}
+
+impl Exit {
+    /// The number that the shell sees (those of `sysexits.h`).
+    #[must_use]
+    pub fn code(self) -> u8 {
+        match self {
+            Self::Ok => 0,
+            Self::Different => 1,
+            Self::Usage => 64,
+            Self::Bug => 70,
+            Self::Io => 74,
+            Self::Configuration => 78,
+        }
+    }
+}
+
+/// Parses the command line and does what it says.
+#[must_use]
+pub fn main() -> ExitCode {
+    let arguments = match CommandLine::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            let code = if error.use_stderr() { Exit::Usage } else { Exit::Ok };
+            // Nothing is left to tell anybody when the terminal itself is gone.
+            let _ = error.print();
+            return ExitCode::from(code.code());
+        }
+    };
+    if let Err(text) = crate::telemetry::start(&arguments.log, arguments.log_format) {
+        print_error(&text);
+        return ExitCode::from(Exit::Usage.code());
+    }
+    let exit = match arguments.command {
+        Subcommand::Run(options) => run::run(&options),
+        Subcommand::Demo(options) => demo::run(&options),
+        Subcommand::Check(options) => check::run(&options),
+        Subcommand::Map(options) => map::run(&options),
+        Subcommand::Sim(options) => sim::command(&options),
+        Subcommand::Replay(options) => replay::run(&options),
+        Subcommand::Schema(options) => schema::run(&options),
+        Subcommand::Completions(options) => completions::run(&options),
+    };
+    ExitCode::from(exit.code())
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        CommandLine::command().debug_assert();
+    }
+
+    #[test]
+    fn every_subcommand_can_be_parsed() {
+        for words in [
+            &["run"][..],
+            &["demo"],
+            &["check", "a.toml"],
+            &["map", "--format", "csv"],
+            &["map", "diff", "a.json", "b.json"],
+            &["sim", "detcon", "-i", "vcan0", "--node", "1"],
+            &["replay", "bus.log"],
+            &["schema", "config"],
+            &["completions", "bash"],
+        ] {
+            let line = std::iter::once("cangate").chain(words.iter().copied());
+            assert!(CommandLine::try_parse_from(line).is_ok(), "{words:?}");
+        }
+    }
+
+    #[test]
+    fn exit_codes_are_those_of_the_contract() {
+        let all = [Exit::Ok, Exit::Different, Exit::Usage, Exit::Bug, Exit::Io, Exit::Configuration];
+        assert_eq!(all.map(Exit::code), [0, 1, 64, 70, 74, 78]);
+    }
+}

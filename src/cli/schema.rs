@@ -1,4 +1,8 @@
-//! `cangate schema config|mapping`: JSON Schema of the files, for editors.
+//! `cangate schema config|mapping`: JSON Schema of the files, for editors. \[IO\]
+
+use super::Exit;
+use super::args::SchemaArguments;
+use super::output::write_out;
 
 /// Which file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -7,6 +11,11 @@ pub enum Schema {
     Config,
     /// A device mapping.
     Mapping,
+}
+
+/// Prints the schema.
+pub(super) fn run(arguments: &SchemaArguments) -> Exit {
+    write_out(&format!("{}\n", schema(arguments.of)), None)
 }
 
 /// The schema as indented JSON.

@@ -1,16 +1,20 @@
 //! `cangate sim`: simulated devices on a bus, with orders from the standard input. \[IO\]
 
-use std::io::{BufRead, Write};
+use std::io::{BufRead, BufReader, Write};
 
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
+use super::Exit;
+use super::args::{SimArguments, SimDevice};
+use super::output::{block_on, print_error};
 use crate::can::interface::Interface;
 use crate::can::{self, BusIndex};
 use crate::canopen::NodeId;
 use crate::simulator::scenario::{SHIPPED, Scenario};
 use crate::simulator::task::{self, BusEnd};
 use crate::simulator::{DevicePlan, SimulatorError};
+use crate::supervisor::shutdown;
 use crate::time::Clock;
 
 /// Frames that wait for the bus. 127 devices that start at once send 508.
@@ -74,6 +78,34 @@ impl SimError {
 
 fn names() -> String {
     SHIPPED.map(|(name, _)| name).join(", ")
+}
+
+/// Runs until a signal, with orders from the standard input.
+pub(super) fn command(arguments: &SimArguments) -> Exit {
+    let SimDevice::Detcon = arguments.device;
+    let Some(node) = NodeId::new(arguments.node) else { return Exit::Usage };
+    let options = SimOptions {
+        interface: arguments.interface.clone(),
+        node,
+        count: arguments.count,
+        scenario: arguments.scenario.clone(),
+        seed: arguments.seed,
+    };
+    block_on(async {
+        let stop = CancellationToken::new();
+        if let Err(error) = shutdown::on_signal(stop.clone()) {
+            print_error(&format!("signals cannot be handled: {error}"));
+            return Exit::Io;
+        }
+        let input = BufReader::new(std::io::stdin());
+        match run(options, input, std::io::stdout(), Clock::start(), stop).await {
+            Ok(()) => Exit::Ok,
+            Err(error) => {
+                print_error(&error.to_string());
+                if error.exit_code() == Exit::Usage.code() { Exit::Usage } else { Exit::Configuration }
+            }
+        }
+    })
 }
 
 /// The devices that are asked for. Reads the scenario's file.

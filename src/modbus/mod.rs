@@ -4,6 +4,7 @@
 //! - [`settings`]: the `[modbus]` table of the configuration.
 //! - [`node_block`], [`gateway_block`], [`event_ring`]: the fixed blocks, each with what its registers mean.
 //! - [`register_map`]: which unit and address shows what; built once from the tag table, immutable.
+//!   [`map_text`] writes it for people and programs; `map diff`.
 //!   [`address_space`] is the part that is the same for registers and bits, [`points`] the list for people.
 //! - [`register_bank`]: reads registers out of the process image. [`encoding`]: values as registers.
 //!
@@ -24,6 +25,7 @@ pub mod frame;
 pub mod gateway_block;
 pub mod heartbeat;
 pub mod identification;
+pub mod map_text;
 pub mod node_block;
 pub mod pdu;
 pub mod points;
@@ -36,6 +38,7 @@ pub mod slots;
 mod source;
 
 pub use counters::{CounterValues, Counters, End};
+pub use map_text::{MapDiff, MapFormat};
 pub use points::{MapDocument, Point, Table};
 pub use register_bank::RegisterBank;
 pub use register_map::{MapError, RegisterMap};

@@ -261,7 +261,7 @@ fn r_det_033_the_loss_comes_at_most_1600_ms_after_the_last_valid_reply() {
 }
 
 #[test]
-fn r_det_036_the_node_is_lost_after_exactly_the_life_time_factor() {
+fn r_det_032_and_036_the_node_is_lost_after_exactly_the_life_time_factor() {
     for factor in [1, 2, 5, 255] {
         let mut bench = running_with(with_guarding(|guarding| guarding.life_time_factor = factor));
         bench.run(500 * 300);

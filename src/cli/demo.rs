@@ -1,0 +1,178 @@
+//! `cangate demo`: two simulated engines, a broker and the gateway in one process. \[IO\]
+
+use std::net::SocketAddr;
+
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+use super::args::DemoArguments;
+use super::output::{block_on, print_error, print_line};
+use super::{Exit, load, run};
+use crate::can::interface::Interface;
+use crate::can::{self, BusIndex};
+use crate::simulator;
+use crate::simulator::task::BusEnd;
+use crate::supervisor::{self, shutdown};
+use crate::time::Clock;
+
+/// The configuration of the demo; what a user would write for two engines.
+const CONFIGURATION: &str = r#"
+version = 1
+[gateway]
+name = "demo"
+[bus.demo]
+interface = "virtual:demo"
+[node.engine1]
+bus = "demo"
+id = 1
+mapping = "motortech-detcon"
+[node.engine2]
+bus = "demo"
+id = 2
+mapping = "motortech-detcon"
+[mqtt]
+"#;
+
+/// Frames and events that wait between the engines and their bus.
+const QUEUE: usize = 256;
+
+/// Runs until a signal.
+pub(super) fn run(options: &DemoArguments) -> Exit {
+    let mut installation = match load::installation_from_text(CONFIGURATION, "demo") {
+        Ok(installation) => installation,
+        Err(exit) => return exit,
+    };
+    installation.modbus.listen = vec![options.modbus];
+    installation.http.listen = options.http;
+    block_on(async {
+        let stop = CancellationToken::new();
+        if let Err(error) = shutdown::on_signal(stop.clone()) {
+            print_error(&format!("signals cannot be handled: {error}"));
+            return Exit::Io;
+        }
+        let broker = match Broker::start(options).await {
+            Ok(broker) => broker,
+            Err(text) => {
+                print_error(&text);
+                return Exit::Io;
+            }
+        };
+        if let Some(mqtt) = &mut installation.mqtt {
+            match broker.url().parse() {
+                Ok(url) => mqtt.url = url,
+                Err(error) => {
+                    print_error(&format!("--broker: {error}"));
+                    return Exit::Usage;
+                }
+            }
+        }
+        let clock = Clock::start();
+        let bound = match supervisor::bind(installation, clock).await {
+            Ok(bound) => bound,
+            Err(error) => {
+                print_error(&format!("{error}; choose other addresses with --modbus, --mqtt and --http"));
+                return Exit::Io;
+            }
+        };
+        let engines = tokio::spawn(simulate(clock, stop.clone()));
+        tell(&bound, &broker);
+        let exit = run::ended(&bound.run(stop.clone()).await);
+        stop.cancel();
+        broker.stop().await;
+        // The engines end with `stop`; what became of them does not matter to the user any more.
+        let _ = engines.await;
+        exit
+    })
+}
+
+/// The two engines on their virtual bus.
+async fn simulate(clock: Clock, stop: CancellationToken) {
+    let interface = Interface::Virtual("demo".to_owned());
+    let (events_to_us, events) = mpsc::channel(QUEUE);
+    let (transmit, to_send) = mpsc::channel(QUEUE);
+    // No orders: the demo tells its story by itself.
+    let (_, lines) = mpsc::channel(1);
+    let bus = can::task::run(BusIndex(0), interface, events_to_us, to_send, clock, stop.clone());
+    let end = BusEnd { events, transmit };
+    tokio::join!(bus, simulator::task::run(simulator::demo(), end, lines, std::io::sink(), clock, stop));
+}
+
+/// The three lines that a newcomer can paste, and what there is to see.
+fn tell(bound: &supervisor::Bound, broker: &Broker) {
+    let modbus = bound.modbus_addresses().first().copied();
+    let (host, port) =
+        modbus.map_or((String::new(), 0), |address| (address.ip().to_string(), address.port()));
+    let (broker_host, broker_port) = broker.host_and_port();
+    let page = format!("http://{}/", bound.http_address());
+    for line in [
+        "cangate demo: two simulated engines; Ctrl-C ends it. Connect from another terminal:".to_owned(),
+        String::new(),
+        format!("  Modbus TCP   mbpoll -m tcp -a 1 -0 -r 100 -c 20 -t 3 -1 -p {port} {host}"),
+        format!("  MQTT         mosquitto_sub -h {broker_host} -p {broker_port} -v -t 'cangate/#'"),
+        format!("  page         {page}"),
+        String::new(),
+        "Engine 1 knocks on cylinder 7 within ten seconds (register 106, unit 1), and again every minute;".to_owned(),
+        "unit 2 is the other engine, unit 247 the gateway. `cangate demo --help` tells how to move the ports.".to_owned(),
+        String::new(),
+    ] {
+        if !print_line(&line) {
+            return;
+        }
+    }
+}
+
+/// The broker that the demo publishes to.
+enum Broker {
+    #[cfg(feature = "embedded-broker")]
+    Inside(crate::mqtt::broker::EmbeddedBroker),
+    Outside(String),
+}
+
+impl Broker {
+    async fn start(options: &DemoArguments) -> Result<Self, String> {
+        match &options.broker {
+            Some(url) => Ok(Self::Outside(url.clone())),
+            None => Self::start_inside(options.mqtt).await,
+        }
+    }
+
+    #[cfg(feature = "embedded-broker")]
+    async fn start_inside(address: SocketAddr) -> Result<Self, String> {
+        let broker = crate::mqtt::broker::EmbeddedBroker::start(address).await;
+        broker.map(Self::Inside).map_err(|error| format!("{error} (choose another address with --mqtt)"))
+    }
+
+    #[cfg(not(feature = "embedded-broker"))]
+    async fn start_inside(address: SocketAddr) -> Result<Self, String> {
+        Err(format!(
+            "this binary was built without a broker (feature `embedded-broker`) for {address}; use --broker mqtt://HOST"
+        ))
+    }
+
+    fn url(&self) -> String {
+        match self {
+            #[cfg(feature = "embedded-broker")]
+            Self::Inside(broker) => format!("mqtt://{}", broker.local_addr()),
+            Self::Outside(url) => url.clone(),
+        }
+    }
+
+    fn host_and_port(&self) -> (String, String) {
+        let url = self.url();
+        let address = url.strip_prefix("mqtt://").unwrap_or(&url);
+        let (host, port) = address.rsplit_once(':').unwrap_or((address, "1883"));
+        (host.trim_matches(['[', ']']).to_owned(), port.to_owned())
+    }
+
+    #[cfg_attr(
+        not(feature = "embedded-broker"),
+        expect(clippy::unused_async, reason = "nothing to stop without a broker")
+    )]
+    async fn stop(self) {
+        match self {
+            #[cfg(feature = "embedded-broker")]
+            Self::Inside(broker) => broker.shutdown().await,
+            Self::Outside(_) => {}
+        }
+    }
+}

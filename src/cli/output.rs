@@ -1,0 +1,70 @@
+//! Printing: the only place that writes to standard output and standard error. \[IO\]
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use super::Exit;
+use crate::mapping::Diagnostic;
+
+/// A line for the user on standard output. `false` when nobody reads any more (`| head`).
+pub(super) fn print_line(text: &str) -> bool {
+    writeln!(io::stdout().lock(), "{text}").is_ok()
+}
+
+/// A line on standard error.
+pub(super) fn print_error(text: &str) {
+    // If standard error is gone there is nowhere left to say so.
+    let _ = writeln!(io::stderr().lock(), "cangate: {text}");
+}
+
+/// A text on standard error, as it is.
+pub(super) fn print_text(text: &str) {
+    let _ = writeln!(io::stderr().lock(), "{text}");
+}
+
+/// All diagnostics on standard error.
+pub(super) fn print_diagnostics(diagnostics: &[Diagnostic]) {
+    for diagnostic in diagnostics {
+        print_text(&diagnostic.to_string());
+    }
+}
+
+/// Writes a text to a file, or to standard output without one.
+pub(super) fn write_out(text: &str, file: Option<&Path>) -> Exit {
+    let written = match file {
+        Some(file) => {
+            std::fs::write(file, text).map_err(|error| format!("cannot write {}: {error}", file.display()))
+        }
+        None => io::stdout()
+            .lock()
+            .write_all(text.as_bytes())
+            .or_else(|error| if error.kind() == io::ErrorKind::BrokenPipe { Ok(()) } else { Err(error) })
+            .map_err(|error| format!("cannot write to standard output: {error}")),
+    };
+    match written {
+        Ok(()) => Exit::Ok,
+        Err(text) => {
+            print_error(&text);
+            Exit::Io
+        }
+    }
+}
+
+/// Reads a text file, or says why not.
+pub(super) fn read_file(path: &Path) -> Result<String, Exit> {
+    std::fs::read_to_string(path).map_err(|error| {
+        print_error(&format!("cannot read {}: {error}", path.display()));
+        Exit::Io
+    })
+}
+
+/// Runs a future on a new runtime.
+pub(super) fn block_on(future: impl Future<Output = Exit>) -> Exit {
+    match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime.block_on(future),
+        Err(error) => {
+            print_error(&format!("the runtime cannot be started: {error}"));
+            Exit::Io
+        }
+    }
+}

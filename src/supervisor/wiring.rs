@@ -1,0 +1,219 @@
+//! Builds the parts of the gateway, binds its listeners, spawns its tasks. \[IO\]
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use tokio::sync::{mpsc, watch};
+use tokio_util::sync::CancellationToken;
+use tracing::info;
+
+use super::tasks::{Ended, Tasks};
+use super::{health, readings};
+use crate::can::interface::Interface;
+use crate::can::{self, BusIndex};
+use crate::gateway::{self, Gateway, Health};
+use crate::mapping::TagTable;
+use crate::modbus::gateway_block::MAP_VERSION;
+use crate::modbus::{self, MapFormat, ModbusSettings, RegisterBank, RegisterMap, map_text};
+use crate::mqtt::{self, Identity, MqttSettings, MqttStatus, Publisher};
+use crate::process_image::{ImageReader, ImageWriter, process_image};
+use crate::time::Clock;
+use crate::web::server::WebError;
+use crate::web::{self, About, WebSettings, WebState};
+
+/// Bus events that wait for the gateway; beyond it the bus tasks wait, and the kernel's receive buffer absorbs.
+const BUS_EVENTS: usize = 1024;
+/// Frames that wait for a bus; beyond it a command fails as "busy" and a guard request is dropped, never sent late.
+const TRANSMIT: usize = 64;
+/// Requests of northbounds that wait for the gateway; beyond it they are answered "busy".
+const COMMANDS: usize = 32;
+
+/// A checked installation: everything that has to be known before anything is started.
+#[derive(Clone, Debug)]
+pub struct Installation {
+    /// Nodes, tags, alarms.
+    pub table: Arc<TagTable>,
+    /// How each bus of the table is reached.
+    pub interfaces: Vec<Interface>,
+    /// The register map, built from the table.
+    pub map: Arc<RegisterMap>,
+    /// Modbus TCP.
+    pub modbus: ModbusSettings,
+    /// MQTT, where there is a broker.
+    pub mqtt: Option<MqttSettings>,
+    /// HTTP.
+    pub http: WebSettings,
+}
+
+/// Why the gateway could not start: something outside is not as it has to be.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// A Modbus listener.
+    #[error(transparent)]
+    Modbus(#[from] modbus::BindError),
+    /// The HTTP listener.
+    #[error(transparent)]
+    Web(#[from] WebError),
+}
+
+/// A gateway whose listeners are bound, but of which nothing runs yet.
+#[derive(Debug)]
+pub struct Bound {
+    installation: Installation,
+    gateway: Gateway,
+    writer: ImageWriter,
+    reader: ImageReader,
+    modbus: modbus::Server,
+    web: web::Server,
+    mqtt_status: watch::Sender<MqttStatus>,
+    identity: Identity,
+    /// Set once every task is spawned: then `/readyz` says so.
+    ready: Arc<AtomicBool>,
+    clock: Clock,
+}
+
+/// Names this run for ever.
+fn identity(map: &RegisterMap, clock: Clock) -> Identity {
+    Identity {
+        sid: uuid::Uuid::new_v4().to_string(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        map_version: MAP_VERSION.into(),
+        map_hash: map.hash_text(),
+        started: clock.now(),
+    }
+}
+
+/// Builds everything and binds every listener.
+///
+/// # Errors
+/// A listener's address cannot be used.
+pub async fn bind(installation: Installation, clock: Clock) -> Result<Bound, StartError> {
+    let Installation { table, map, modbus, http, .. } = &installation;
+    let gateway = Gateway::new(Arc::clone(table), clock.now());
+    let (writer, reader) = process_image(gateway.empty_image());
+    let bank = RegisterBank::new(Arc::clone(table), Arc::clone(map));
+    let modbus = modbus::Server::bind(modbus, bank, reader.clone(), clock).await?;
+    let (mqtt_status, mqtt_seen) = watch::channel(MqttStatus::default());
+    let identity = identity(map, clock);
+    let counters = modbus.counters();
+    let mqtt_seen = installation.mqtt.is_some().then_some(mqtt_seen);
+    let ready = Arc::new(AtomicBool::new(false));
+    let running = Arc::clone(&ready);
+    let health = move || {
+        let starting = (!running.load(Ordering::Acquire)).then(|| "the tasks are being started".to_owned());
+        let session = mqtt_seen.as_ref().map(|seen| seen.borrow().clone());
+        readings::program_health(starting.into_iter().collect(), &counters.values(), session.as_ref())
+    };
+    let state = WebState {
+        table: Arc::clone(table),
+        reader: reader.clone(),
+        clock,
+        about: About {
+            version: identity.version.clone(),
+            map_version: identity.map_version,
+            map_hash: identity.map_hash.clone(),
+            started: identity.started,
+        },
+        health: Arc::new(health),
+        map_json: map_text::render(map, MapFormat::Json).into(),
+        map_csv: map_text::render(map, MapFormat::Csv).into(),
+    };
+    let web = web::Server::bind(http, state).await?;
+    Ok(Bound { installation, gateway, writer, reader, modbus, web, mqtt_status, identity, ready, clock })
+}
+
+impl Bound {
+    /// Where Modbus TCP listens.
+    #[must_use]
+    pub fn modbus_addresses(&self) -> Vec<SocketAddr> {
+        self.modbus.local_addrs()
+    }
+
+    /// Where the page is.
+    #[must_use]
+    pub fn http_address(&self) -> SocketAddr {
+        self.web.local_addr()
+    }
+
+    /// Runs everything until `stop`, or until a bug of ours ends a task.
+    pub async fn run(self, stop: CancellationToken) -> Ended {
+        self.log_where_it_listens();
+        let mut tasks = Tasks::default();
+        let (events, event_queue) = mpsc::channel(BUS_EVENTS);
+        let mut transmit = Vec::new();
+        for (index, interface) in self.installation.interfaces.iter().enumerate() {
+            let (frames, frame_queue) = mpsc::channel(TRANSMIT);
+            transmit.push(frames);
+            let bus = can::task::run(
+                BusIndex(index),
+                interface.clone(),
+                events.clone(),
+                frame_queue,
+                self.clock,
+                stop.clone(),
+            );
+            tasks.spawn(format!("bus {interface}"), bus);
+        }
+        drop(events);
+        // Northbounds that may ask for something get a clone of `_commands`; none of them may yet.
+        let (_commands, command_queue) = mpsc::channel(COMMANDS);
+        let (health, health_seen) = watch::channel(Health::default());
+        tasks.spawn(
+            "gateway",
+            gateway::task::run(
+                self.gateway,
+                self.writer,
+                event_queue,
+                transmit,
+                command_queue,
+                health_seen,
+                self.clock,
+                stop.clone(),
+            ),
+        );
+        tasks.spawn("modbus", self.modbus.run(stop.clone()));
+        tasks.spawn("web", self.web.run(stop.clone()));
+        let session = self.installation.mqtt.is_some().then(|| self.mqtt_status.subscribe());
+        tasks.spawn("health", health::run(session, health, stop.clone()));
+        if let Some(settings) = self.installation.mqtt {
+            let table = self.installation.table;
+            let name = table.gateway.clone();
+            let publisher = Publisher::new(table, &settings, self.identity);
+            let (reader, clock, status, stop) = (self.reader, self.clock, self.mqtt_status, stop.clone());
+            tasks.spawn("mqtt", async move {
+                mqtt::client::run(settings, &name, publisher, reader, clock, stop, status).await;
+            });
+        }
+        self.ready.store(true, Ordering::Release);
+        tasks.run(stop).await
+    }
+
+    fn log_where_it_listens(&self) {
+        let table = &self.installation.table;
+        info!(
+            gateway = table.gateway,
+            version = env!("CARGO_PKG_VERSION"),
+            map = self.installation.map.hash_text(),
+            "started"
+        );
+        for address in self.modbus.local_addrs() {
+            info!(%address, "Modbus TCP");
+        }
+        info!("page http://{}/", self.web.local_addr());
+        for (bus, interface) in table.buses.iter().zip(&self.installation.interfaces) {
+            info!(bus = bus.name, %interface, role = ?bus.role, "CAN bus");
+        }
+        for node in &table.nodes {
+            let bus = table.buses.get(node.bus.0).map_or("", |bus| bus.name.as_str());
+            info!(
+                node = node.name,
+                bus,
+                id = node.canopen.id.get(),
+                unit = node.unit_id,
+                mapping = node.device.mapping,
+                "node"
+            );
+        }
+    }
+}
