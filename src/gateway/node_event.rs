@@ -311,11 +311,12 @@ impl Gateway {
         self.count(at.1, |counters| &mut counters.nmt_commands_sent);
         self.change(at.1, |node| match request {
             NmtRequest::Start => node.stop_ordered = false,
-            NmtRequest::Stop => {
+            // Both hold the node back until an operator starts it.
+            NmtRequest::Stop | NmtRequest::EnterPreOperational => {
                 node.stop_ordered = true;
                 node.start_failed = None;
             }
-            NmtRequest::EnterPreOperational | NmtRequest::ResetNode | NmtRequest::ResetCommunication => {}
+            NmtRequest::ResetNode | NmtRequest::ResetCommunication => {}
         });
         self.tell(at, "nmt_command_sent", |event| request_word(request).clone_into(&mut event.to));
     }

@@ -90,7 +90,13 @@ fn identity(map: &RegisterMap, clock: Clock) -> Identity {
 /// A listener's address cannot be used.
 pub async fn bind(installation: Installation, clock: Clock) -> Result<Bound, StartError> {
     let Installation { table, map, modbus, http, .. } = &installation;
-    let gateway = Gateway::new(Arc::clone(table), clock.now());
+    let mut gateway = Gateway::new(Arc::clone(table), clock.now());
+    for (index, interface) in installation.interfaces.iter().enumerate() {
+        // Nothing real can be on a bus inside this process.
+        if matches!(interface, Interface::Virtual(_)) {
+            gateway.mark_simulated(BusIndex(index));
+        }
+    }
     let (writer, reader) = process_image(gateway.empty_image());
     let bank = RegisterBank::new(Arc::clone(table), Arc::clone(map));
     let modbus = modbus::Server::bind(modbus, bank, reader.clone(), clock).await?;
