@@ -27,7 +27,11 @@ fn every_event_arrives_in_order_though_the_broker_is_killed_twenty_times() {
     let device = Device::start(1, 5);
     let status = |bits: u8| [bits, 128, 0xFF, 0xFF, 0, 0, 153, 204];
     device.send_periodically([&[1; 8], &[2; 8], &status(0), &[4, 4, 4, 4, 15, 0]]);
-    let gateway = Setup::one_detcon().broker_port(cable.port).start();
+    let gateway = Setup::one_detcon()
+        .broker_port(cable.port)
+        .mqtt_key("reconnect_max_s = 1")
+        .more("[node.engine1.alarm.low_rpm]\non_delay_ms = 0\noff_delay_ms = 0")
+        .start();
     gateway.node(1).wait_for_status("good data", |status| status.all_good());
     // Only the status bit makes events from here on.
     device.send_periodically([&[1; 8], &[2; 8], &status(0), &[4, 4, 4, 4, 15, 0]]);

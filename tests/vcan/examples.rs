@@ -3,6 +3,8 @@
 //! V-DET-02, 03, 14 and 15 are conversations and stand in `guarding`; 18 and 19 are about the device's timing, here with
 //! `cangate sim` for the device's side and the same frames by cansend for the gateway's.
 
+use std::time::Duration;
+
 use serde_json::{Value, json};
 
 use crate::harness::broker::{Broker, Subscriber};
@@ -11,7 +13,7 @@ use crate::harness::device::Device;
 use crate::harness::gateway::{Gateway, Setup, TOPICS, simulator};
 use crate::harness::modbus::{Table, mbpoll, pymodbus};
 use crate::harness::process::Process;
-use crate::harness::wait::{GENEROUS, wait_until, within};
+use crate::harness::wait::{GENEROUS, give_it, wait_until, within};
 
 /// Where the values of a DetCon start.
 const INTENSITY: u16 = 100;
@@ -42,7 +44,11 @@ impl Bench {
         let subscriber = Subscriber::start(&broker, TOPICS);
         let device = Device::start(node, 5);
         // The test sends one frame at a time and reads it in peace.
-        let gateway = Setup::detcons(&[node]).broker(&broker).node_key("pdo_timeout_ms = 60000").start();
+        let gateway = Setup::detcons(&[node])
+            .broker(&broker)
+            .node_key("pdo_timeout_ms = 60000")
+            .more(&format!("[node.engine{node}.alarm.\"sensor_fault_*\"]\non_delay_ms = 0\noff_delay_ms = 0"))
+            .start();
         gateway.node(node).wait_for_status("a guarded device", |status| status.supervision_ok());
         Self { subscriber, _broker: broker, _device: device, gateway, node }
     }
@@ -407,8 +413,7 @@ fn expect_sending(capture: &Capture, simulator: &mut Process, command: &str, sen
     } else {
         // Two periods of silence, counted from the command.
         assert!(
-            within(std::time::Duration::from_millis(1500), || (tpdos(capture, from) > 0).then_some(()))
-                .is_none(),
+            within(Duration::from_millis(1500), || (tpdos(capture, from) > 0).then_some(())).is_none(),
             "TPDOs after {command}"
         );
     }
@@ -455,4 +460,34 @@ fn v_det_18_r_det_070_to_075_078_status_frames_out_of_step_are_all_taken() {
         bench.expect_registers("V-DET-18", STATUS_BITS, &[knocking]);
     }
     bench.expect_registers("V-DET-18", USED, &[0xFFFF]);
+}
+
+#[test]
+fn v_det_19_r_det_069_070_076_079_knocking_on_channel_18_speeds_up_three_tpdos() {
+    let _bus = take_the_bus();
+    let mut simulator = simulator(1, &[]);
+    let gateway = Setup::one_detcon().start();
+    let registers = gateway.node(1);
+    registers.wait_for_status("a good DetCon", |status| status.all_good());
+    // Only the knock flag may cause events of TPDO3.
+    for order in ["set analog_output 16", "set load_reduction 0", "set used_sensor_18 1"] {
+        simulator.say(order);
+    }
+    let capture = Capture::start();
+    simulator.say("knock 18 on");
+    wait_until("channel 18 to be the loudest", || registers.register(129) == 18);
+    give_it(Duration::from_secs(2));
+    let knocking = registers.bit(0);
+    simulator.say("knock 18 off");
+    wait_until("the end of the knocking", || knocking && !registers.bit(0));
+
+    let status_bit = |frame: &str| frame.strip_prefix("381#").map(|data| &data[1..2] == "1");
+    let frames = capture.frames();
+    let begin = frames.iter().position(|frame| status_bit(frame) == Some(true)).unwrap();
+    let end = begin + frames[begin..].iter().position(|frame| status_bit(frame) == Some(false)).unwrap();
+    let count = |id: &str| frames[begin..end].iter().filter(|frame| frame.starts_with(id)).count();
+    let fast = [count("181#"), count("281#"), count("481#")];
+    println!("V-DET-19: while knocking TPDO1, 2, 4 {fast:?}, TPDO3 {}", count("381#"));
+    assert!(fast.iter().all(|fast| *fast > 2 * count("381#")), "{fast:?} and {}", count("381#"));
+    assert_eq!(registers.register(170), 1, "one rise of engine_knocking");
 }

@@ -14,7 +14,7 @@ fn r_det_043_two_detcons_and_a_second_master() {
     let broker = Broker::start();
     let subscriber = Subscriber::start(&broker, TOPICS);
     let capture = Capture::start();
-    let _first = simulator(1, &[]);
+    let mut first = simulator(1, &[]);
     let _second = simulator(2, &["--seed", "7"]);
     let gateway = Setup::detcons(&[1, 2]).broker(&broker).start();
     for node in [1, 2] {
@@ -26,19 +26,24 @@ fn r_det_043_two_detcons_and_a_second_master() {
     let online = gateway.unit().input(4, 1)[0];
     assert!(online == 0b110 || online == 0b11, "bitmap of online nodes: {online:#b}");
 
-    // Another master guards node 1 and stops node 2.
+    // Another master guards node 1 and stops it again and again.
     let (messages, frames) = (subscriber.count(), capture.count());
-    cansend("701#R1");
+    first.say("second master on");
     subscriber.wait_for("engine1/alarm/foreign_guard_master", messages, |payload| payload["active"] == true);
-    cansend("000#0202");
     subscriber.wait_for("bridge/alarm/can0_foreign_master", messages, |payload| payload["active"] == true);
-    // The gateway undoes the stop, and starts nobody else.
-    capture.wait_for("000#0102", frames);
+    capture.wait_for_sequence(&["000#0201", "000#0101"], frames);
+    first.say("second master off");
+    gateway.node(1).wait_for_status("node 1 again", |status| status.operational() && status.all_good());
+
+    // The same by a program that is not ours, to node 2.
+    cansend("000#0202");
+    capture.wait_for_sequence(&["000#0202", "000#0102"], frames);
     gateway.node(2).wait_for_status("node 2 again", |status| status.operational() && status.all_good());
+    // Each stop was undone for the node that it hit, and nothing else was commanded.
     let commands: BTreeSet<_> =
         capture.frames().into_iter().skip(frames).filter(|frame| frame.starts_with("000#")).collect();
-    assert_eq!(commands, BTreeSet::from(["000#0102".to_owned(), "000#0202".to_owned()]));
-    assert!(gateway.node(1).status().operational(), "node 1 runs on");
+    let expected = ["000#0201", "000#0101", "000#0202", "000#0102"];
+    assert_eq!(commands, expected.map(str::to_owned).into());
 }
 
 #[test]

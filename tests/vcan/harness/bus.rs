@@ -82,10 +82,15 @@ impl Capture {
         self.frames().len()
     }
 
-    /// Waits until a frame came after the first `after` frames; gives its place.
+    /// Waits until a frame came after the first `after` frames; gives its place. A frame that ends in `#` stands for any
+    /// data of that identifier.
     pub fn wait_for(&self, frame: &str, after: usize) -> usize {
         wait_for(format!("{frame} on {BUS}"), || {
-            self.frames().iter().skip(after).position(|seen| seen == frame).map(|place| place + after)
+            self.frames()
+                .iter()
+                .skip(after)
+                .position(|seen| seen == frame || frame.ends_with('#') && seen.starts_with(frame))
+                .map(|place| place + after)
         })
     }
 

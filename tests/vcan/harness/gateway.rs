@@ -23,6 +23,7 @@ pub struct Setup {
     mqtt: Option<u16>,
     nodes: Vec<(String, u8)>,
     node_keys: String,
+    mqtt_keys: String,
     more: String,
 }
 
@@ -35,7 +36,14 @@ impl Setup {
     /// A master with DetCons `engine<n>` of these node ids.
     pub fn detcons(ids: &[u8]) -> Self {
         let nodes = ids.iter().map(|id| (format!("engine{id}"), *id)).collect();
-        Self { role: "master", mqtt: None, nodes, node_keys: String::new(), more: String::new() }
+        Self {
+            role: "master",
+            mqtt: None,
+            nodes,
+            node_keys: String::new(),
+            mqtt_keys: String::new(),
+            more: String::new(),
+        }
     }
 
     /// With a broker.
@@ -61,6 +69,12 @@ impl Setup {
         self
     }
 
+    /// A line for the broker.
+    pub fn mqtt_key(mut self, line: &str) -> Self {
+        writeln!(self.mqtt_keys, "{line}").unwrap();
+        self
+    }
+
     /// Text at the end of the file.
     pub fn more(mut self, text: &str) -> Self {
         writeln!(self.more, "{text}").unwrap();
@@ -82,7 +96,7 @@ impl Setup {
         if let Some(port) = self.mqtt {
             write!(text, "[mqtt]\nurl = \"mqtt://127.0.0.1:{port}\"\n").unwrap();
         }
-        text + &self.more
+        text + &self.mqtt_keys + &self.more
     }
 
     /// Starts the gateway and waits until it answers Modbus.
