@@ -135,7 +135,7 @@ fn v_det_03_r_det_023_029_040_041_every_guarding_byte_is_read_as_what_it_is() {
 
     for (state, name, replies) in [
         (4, "stopped", ["701#04", "701#84"]),
-        (127, "pre-operational", ["701#7F", "701#FF"]),
+        (127, "pre_operational", ["701#7F", "701#FF"]),
         (5, "operational", ["701#05", "701#85"]),
     ] {
         let (frames, messages) = (hall.capture.count(), hall.subscriber.count());

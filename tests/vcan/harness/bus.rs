@@ -46,8 +46,8 @@ pub struct Capture {
 impl Capture {
     /// Starts candump and waits until it listens.
     pub fn start() -> Self {
-        // -L: log format; -e is left out: error frames are no frames of a participant.
-        let candump = Process::start("candump", Command::new("candump").args(["-L", BUS]));
+        // -L: log format; -D: stay when the interface goes down; -e is left out: error frames are no frames of a participant.
+        let candump = Process::start("candump", Command::new("candump").args(["-L", "-D", BUS]));
         // A frame that no participant of any test knows, sent until it is seen.
         let capture = Self { candump };
         wait_until("candump to listen", || {

@@ -12,6 +12,7 @@ import sys
 
 from pymodbus import ModbusException
 from pymodbus.client import ModbusTcpClient
+from pymodbus.exceptions import ConnectionException
 
 clients = {}
 
@@ -58,12 +59,21 @@ def identify(client, request):
     return objects
 
 
-for line in sys.stdin:
-    request = json.loads(line)
+def answer(request):
+    reused = getattr(clients.get(request["port"]), "connected", False)
+    client = connected(request["port"])
     try:
-        client = connected(request["port"])
-        result = identify(client, request) if request.get("identify") else read(client, request)
-        print(json.dumps({"result": result}), flush=True)
+        return identify(client, request) if request.get("identify") else read(client, request)
+    except ConnectionException:
+        # The server may have been restarted since the last request.
+        clients.pop(request["port"]).close()
+        if not reused:
+            raise
+        return answer(request)
+
+
+for line in sys.stdin:
+    try:
+        print(json.dumps({"result": answer(json.loads(line))}), flush=True)
     except (ModbusException, ConnectionError, ValueError, OSError) as error:
-        clients.pop(request["port"], None)
         print(json.dumps({"error": f"{type(error).__name__}: {error}"}), flush=True)
