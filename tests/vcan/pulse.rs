@@ -43,17 +43,15 @@ fn r_det_092_a_trip_of_100_ms_is_seen_by_a_client_that_polls_every_five_seconds(
     assert_eq!(read(Table::Input, TRIP_RISES), rises + 1, "counted once");
     assert!(read(Table::Input, SECONDS_SINCE_TRIP) < 60);
     assert!(gateway.unit().u32(200) > newest_event, "an event in the ring");
-    let names = |active: bool| {
-        wait_for(format!("the trip alarm, active {active}"), || {
-            subscriber
-                .of("engine1/alarm/trip", messages)
-                .into_iter()
-                .find(|message| message.payload["active"] == active)
+    let alarm = |state: &str| {
+        wait_for(format!("the trip alarm to be {state}"), || {
+            let seen = subscriber.of("engine1/alarm/trip", messages);
+            seen.into_iter().find(|message| message.payload["state"] == state)
         })
     };
-    let (came, went) = (names(true), names(false));
+    let (came, went) = (alarm("unacknowledged"), alarm("latched_unacknowledged"));
     assert_eq!(came.payload["priority"], "critical");
-    assert_eq!(went.payload["acknowledged"], false, "it waits for somebody to see it");
+    assert_eq!(went.payload["active"], true, "it waits for somebody to see it");
     let event =
         subscriber.wait_for("event", messages, |event| event["kind"] == "alarm" && event["name"] == "trip");
     assert_eq!(event.payload["node"], "engine1");
