@@ -167,6 +167,10 @@ impl Gateway {
             bus.heard_at = now.instant;
             bus.silent = false;
         }
+        if first && up {
+            // What was asked before the interface was open did not leave: all nodes are asked now (R-DET-046).
+            bus.network.handle_link(now, false);
+        }
         if up != was_up || first {
             bus.network.handle_link(now, up);
         }
@@ -203,7 +207,12 @@ impl Gateway {
     pub(super) fn bus_not_sent(&mut self, now: Now, index: BusIndex, frame: &CanFrame) {
         let Some(bus) = self.buses.get_mut(index.0) else { return };
         bus.network.handle_not_sent(now, frame);
-        self.tell_bus(now, index, "frame_not_sent", |event| event.text = format!("{frame} did not leave"));
+        // Before the interface is open nothing can leave, and that is no news.
+        if bus.link.is_some() {
+            self.tell_bus(now, index, "frame_not_sent", |event| {
+                event.text = format!("{frame} did not leave");
+            });
+        }
         self.drain_network(now, index);
     }
 

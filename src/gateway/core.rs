@@ -415,6 +415,17 @@ mod tests {
     }
 
     #[test]
+    fn r_det_046_nodes_are_asked_at_once_when_the_interface_is_open() {
+        let mut bench = Bench::new(fixture::table());
+        bench.run_to(0);
+        bench.bus(BusEvent::NotSent { frame: "701#R1".parse().unwrap(), at: Now::from_millis(1) });
+        assert!(bench.gateway.poll_timeout().is_some_and(|(due, _)| due > Now::from_millis(30).instant));
+        bench.link(30, Link::ErrorActive);
+        assert!(bench.gateway.poll_timeout().is_some_and(|(due, _)| due <= Now::from_millis(30).instant));
+        assert!(!bench.events().contains(&"frame_not_sent"), "{:?}", bench.events());
+    }
+
+    #[test]
     fn r_det_084_zero_on_bad_replaces_the_value_where_it_is_asked_for() {
         let mut table = fixture::table();
         table.nodes[0].zero_on_bad = true;

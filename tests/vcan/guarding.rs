@@ -39,6 +39,7 @@ fn running() -> Hall {
     device.send_periodically(TPDOS);
     let gateway = Setup::one_detcon().broker(&broker).start();
     gateway.node(1).wait_for_status("good data", |status| status.supervision_ok() && status.all_good());
+    wait_until("guarding", || device.replies() >= 2);
     Hall { subscriber, _broker: broker, capture, device, gateway }
 }
 
