@@ -493,6 +493,7 @@ mod tests {
     #[test]
     fn a_full_queue_to_the_bus_is_counted_and_is_not_the_nodes_fault() {
         let mut bench = Bench::new(fixture::table());
+        bench.link(0, Link::ErrorActive);
         let request = "701#R1".parse().unwrap();
         bench.gateway.handle_refused(Now::from_millis(1), BUS, &request);
         bench.publish();
