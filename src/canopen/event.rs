@@ -1,5 +1,7 @@
 //! What a network tells the gateway.
 
+use std::time::Duration;
+
 use super::{NmtRequest, NmtState, NodeId, PdoIndex};
 use crate::can::{CanFrame, CanId};
 
@@ -88,8 +90,13 @@ pub enum NodeEvent {
     Recovered,
     /// A non-zero state frame nobody had asked for, or after the reply deadline (R-DET-045); reported once.
     UnsolicitedState,
-    /// Somebody else sends guard requests to this node (R-DET-043); reported once until 60 s of silence.
+    /// The node told its state by itself or when asked, for the first time since it was lost or the bus could not be used:
+    /// it is supervised from now on. A boot-up message alone is no such sign.
+    Supervised,
+    /// Somebody else sends guard requests to this node (R-DET-043); told once.
     ForeignGuardMaster,
+    /// No guard request of somebody else for 60 s after `ForeignGuardMaster`.
+    ForeignGuardMasterGone,
     /// A frame on the error control identifier with a wrong length (R-DET-042), of which the first byte counts if there
     /// is one; or an emergency message that is too short, or a remote or 29-bit frame on one of the node's identifiers
     /// (R-DET-006), which are ignored.
@@ -106,6 +113,11 @@ pub enum NodeEvent {
     StartFailed {
         /// Start commands sent so far.
         attempts: u32,
+    },
+    /// The node boots again and again, probably because it is started: its next start waits.
+    StartHeldBack {
+        /// How long.
+        wait: Duration,
     },
     /// The node is operational after a `StartFailed`.
     StartSucceeded,

@@ -74,8 +74,9 @@ impl Strangers {
 }
 
 impl Network {
-    /// A network of which nothing is known yet, on a bus that can be used. Guards every node at once, without waiting
-    /// for a boot-up (R-DET-046), one a few milliseconds after the other.
+    /// A network of which nothing is known yet, on a bus that cannot be used before [`handle_link`](Self::handle_link)
+    /// says so. Then every node is guarded at once, without waiting for a boot-up (R-DET-046), one a few milliseconds
+    /// after the other.
     ///
     /// Node ids and COB-IDs are to be unique (R-DET-004, checked by the mapping): of two equal ones the first counts.
     #[must_use]
@@ -89,7 +90,7 @@ impl Network {
             extended: BTreeMap::new(),
             strangers: Strangers { standard: vec![false; STANDARD_IDS], extended: BTreeSet::new() },
             outputs: Outputs::new(),
-            link_up: true,
+            link_up: false,
             next: None,
         };
         let mut pdos = Vec::new();
@@ -104,7 +105,9 @@ impl Network {
             let cob_ids = node.pdos.iter().map(|pdo| pdo.cob_id).enumerate();
             pdos.extend(cob_ids.map(|(index, id)| (id, Slot::Pdo(place, PdoIndex(index)))));
             let phase = step.saturating_mul(u32::try_from(place).unwrap_or(0));
-            network.nodes.push(Node::new(node, settings.role, phase, now.instant));
+            let mut node = Node::new(node, settings.role, phase, now.instant);
+            node.pause();
+            network.nodes.push(node);
         }
         for (id, slot) in pdos {
             network.claim(id, slot);
@@ -131,14 +134,20 @@ impl Network {
                 return;
             }
         };
+        if !self.link_up
+            && let Some(node) = &mut node
+        {
+            // It was on its way when the bus went down: it counts, but sets no clock going.
+            node.pause();
+        }
         self.next = earlier(self.next, node.and_then(|node| node.poll_timeout()));
-        if let Some(place) = slot.node().filter(|_| start) {
+        if let Some(place) = slot.node().filter(|_| start && self.link_up) {
             self.start(at, place);
         }
     }
 
     /// A frame of ours did not leave: what waits for its answer must not blame the node.
-    pub fn handle_not_sent(&mut self, _now: Now, frame: &CanFrame) {
+    pub fn handle_not_sent(&mut self, now: Now, frame: &CanFrame) {
         if let Slot::ErrorControl(place) = self.slot(frame.id())
             && frame.is_remote()
             && let Some(node) = self.nodes.get_mut(place)
@@ -148,7 +157,7 @@ impl Network {
             && let Some(request) = NmtRequest::from_code(command)
         {
             for node in self.nodes.iter_mut().filter(|each| node == 0 || each.id.get() == node) {
-                node.command_not_sent(request);
+                node.command_not_sent(now.instant, request);
             }
         }
         self.look_ahead();

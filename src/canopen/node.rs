@@ -32,11 +32,15 @@ pub(super) struct Node {
     pub(super) state: Option<NmtState>,
     /// Where the last NMT command leads, until the node goes elsewhere.
     pub(super) ordered: Option<NmtState>,
+    /// What `ordered` was before the last command of ours, and whether the node was held.
+    before: Option<(Option<NmtState>, bool)>,
     /// Until then a boot-up message is the effect of an ordered reset.
     pub(super) reset_until: Option<Instant>,
     /// Undefined state code that was told last.
     pub(super) invalid: Option<u8>,
     pub(super) unsolicited_told: bool,
+    /// It told its state since it was lost or the bus could not be used.
+    pub(super) supervised: bool,
     /// Until then somebody else is known to guard this node.
     pub(super) foreign_guard_until: Option<Instant>,
     pub(super) seen: bool,
@@ -108,9 +112,11 @@ impl Node {
             pdos: Pdos::new(settings.pdos),
             state: None,
             ordered: None,
+            before: None,
             reset_until: None,
             invalid: None,
             unsolicited_told: false,
+            supervised: false,
             foreign_guard_until: None,
             seen: false,
             never_seen_after: settings.never_seen_after,
@@ -121,7 +127,8 @@ impl Node {
 
     /// Whether nobody would mind if it were started: it may be included in a broadcast.
     pub(super) fn may_be_started_with_all(&self) -> bool {
-        !self.self_starting && self.start.as_ref().is_some_and(|start| !start.is_held())
+        let ready = |start: &Start| !start.is_held() && !start.is_held_back();
+        !self.self_starting && self.start.as_ref().is_some_and(ready)
     }
 
     /// An operator's command, or an automatic one, was sent to this node.
@@ -157,6 +164,7 @@ impl Node {
 
     fn note_sent(&mut self, now: Instant, request: NmtRequest, outputs: &mut Outputs) {
         outputs.node(self.id, NodeEvent::NmtSent { request });
+        self.before = Some((self.ordered, self.start.as_ref().is_some_and(Start::is_held)));
         if let Some(guarding) = self.watch.guarding() {
             guarding.settle(now);
         }
@@ -203,8 +211,19 @@ impl Node {
         }
     }
 
-    /// A command of ours to this node did not leave.
-    pub(super) fn command_not_sent(&mut self, request: NmtRequest) {
+    /// A command of ours to this node did not leave: as if it had not been given.
+    pub(super) fn command_not_sent(&mut self, now: Instant, request: NmtRequest) {
+        if let Some((ordered, held)) = self.before.take() {
+            self.ordered = ordered;
+            if let Some(start) = self.start.as_mut().filter(|start| start.is_held() && !held) {
+                start.release();
+            }
+        }
+        if self.state == Some(NmtState::Operational) && !self.watch.is_lost() {
+            self.pdos.supervise(now);
+        } else {
+            self.pdos.stop();
+        }
         match request {
             NmtRequest::Start => {
                 if let Some(start) = &mut self.start {
@@ -228,6 +247,7 @@ impl Node {
         }
         self.pdos.stop();
         self.never_seen_at = None;
+        self.supervised = false;
     }
 
     /// The bus can be used again: as at the start, but what was known stays known.
@@ -272,6 +292,10 @@ impl Node {
         while let Some(pdo) = self.pdos.next_late(now) {
             outputs.node(self.id, NodeEvent::PdoTimeout { pdo });
         }
+        if self.foreign_guard_until.is_some_and(|until| until <= now) {
+            self.foreign_guard_until = None;
+            outputs.node(self.id, NodeEvent::ForeignGuardMasterGone);
+        }
         if self.duplicate.handle_timeout(now) {
             outputs.node(self.id, NodeEvent::DuplicateCleared);
         }
@@ -296,7 +320,8 @@ impl Node {
         };
         let start = self.start.as_ref().and_then(Start::poll_timeout);
         let never_seen = self.never_seen_at.map(|at| (at, "node never seen"));
-        [watch, start, self.pdos.poll_timeout(), self.duplicate.poll_timeout(), never_seen]
+        let foreign_guard = self.foreign_guard_until.map(|at| (at, "another guarding master"));
+        [watch, start, self.pdos.poll_timeout(), self.duplicate.poll_timeout(), never_seen, foreign_guard]
             .into_iter()
             .flatten()
             .min_by_key(|(at, _)| *at)
@@ -312,6 +337,7 @@ impl Node {
 
     /// The node is lost (R-DET-036).
     pub(super) fn lost(&mut self, stuck_toggle: bool, outputs: &mut Outputs) {
+        self.supervised = false;
         outputs.node(self.id, NodeEvent::Lost { stuck_toggle });
         self.pdos.stop();
         if let Some(start) = &mut self.start {

@@ -12,7 +12,7 @@ use super::{NmtRequest, NmtState, NodeEvent, PdoIndex};
 use crate::can::{CanFrame, CanId};
 use crate::time::Instant;
 
-/// Another guarding master is forgotten, and told anew, after this long without a request of it.
+/// Another guarding master has gone after this long without a request of it.
 const FOREIGN_GUARD_QUIET: Duration = Duration::from_secs(60);
 
 impl Node {
@@ -46,8 +46,7 @@ impl Node {
         if let Some(guarding) = self.watch.guarding() {
             guarding.handle_foreign_request(now);
         }
-        let known = self.foreign_guard_until.replace(now + FOREIGN_GUARD_QUIET);
-        if known.is_none_or(|until| until < now) {
+        if self.foreign_guard_until.replace(now + FOREIGN_GUARD_QUIET).is_none() {
             outputs.node(self.id, NodeEvent::ForeignGuardMaster);
         }
     }
@@ -80,8 +79,8 @@ impl Node {
         self.set_state(NmtState::Initialising, true, outputs);
         self.ordered = None;
         self.pdos.stop();
-        if let Some(start) = &mut self.start {
-            start.handle_boot_up(now);
+        if self.start.as_mut().is_some_and(|start| start.handle_boot_up(now)) {
+            outputs.node(self.id, NodeEvent::StartHeldBack { wait: super::start::STORM_WAIT });
         }
         false
     }
@@ -105,6 +104,9 @@ impl Node {
         };
         if recovered {
             outputs.node(self.id, NodeEvent::Recovered);
+        }
+        if !matches!(self.watch, Watch::Nothing) && !std::mem::replace(&mut self.supervised, true) {
+            outputs.node(self.id, NodeEvent::Supervised);
         }
         let start = self.report(now, code, outputs);
         let reset = recovered && self.start.as_ref().is_some_and(super::start::Start::resets_on_recovery);
@@ -166,7 +168,7 @@ impl Node {
             NmtState::Stopped | NmtState::PreOperational => {
                 self.pdos.stop();
                 let lost = self.watch.is_lost();
-                self.start.as_ref().is_some_and(|start| !lost && start.handle_idle_node())
+                self.start.as_ref().is_some_and(|start| !lost && start.handle_idle_node(now))
             }
         }
     }
@@ -235,7 +237,7 @@ impl Node {
     /// Only an operational node sends TPDOs, so it is believed to be one until it reports its state (R-DET-083).
     fn believe_operational(&mut self, now: Instant, pdo: PdoIndex, outputs: &mut Outputs) {
         let state = self.state;
-        let ordered = state.is_none() || self.ordered == Some(NmtState::Operational);
+        let ordered = self.is_ordered(NmtState::Operational);
         let surprising = state != Some(NmtState::Operational) && !ordered;
         if surprising {
             outputs.node(self.id, NodeEvent::PdoInUnexpectedState { pdo, state });

@@ -1,10 +1,17 @@
 //! Starting one node and seeing to it that it did start (R-DET-016..020).
 
+use std::time::Duration;
+
 use super::StartSettings;
 use crate::time::Instant;
 
 /// Unanswered start commands after which the start has failed (R-DET-020).
 const ATTEMPTS: u32 = 3;
+/// A node that boots so often within [`STORM_WINDOW`] restarts because it is started: its start waits (F14).
+const STORM_BOOTS: usize = 3;
+const STORM_WINDOW: Duration = Duration::from_secs(10);
+/// How long the start of such a node waits.
+pub(super) const STORM_WAIT: Duration = Duration::from_secs(30);
 
 /// The start machine of one node.
 #[derive(Debug)]
@@ -17,6 +24,10 @@ pub(super) struct Start {
     failed: bool,
     /// An operator took the node out of operation: it stays so until an operator starts it.
     held: bool,
+    /// The last boot-up messages, oldest first.
+    boots: [Option<Instant>; STORM_BOOTS],
+    /// The node restarts again and again: it is not started before.
+    quiet_until: Option<Instant>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,7 +52,15 @@ pub(super) struct StartDue {
 impl Start {
     /// Nothing under way.
     pub(super) fn new(settings: StartSettings) -> Self {
-        Self { settings, phase: Phase::Idle, attempts: 0, failed: false, held: false }
+        Self {
+            settings,
+            phase: Phase::Idle,
+            attempts: 0,
+            failed: false,
+            held: false,
+            boots: [None; STORM_BOOTS],
+            quiet_until: None,
+        }
     }
 
     /// Whether an operator took the node out of operation.
@@ -49,22 +68,47 @@ impl Start {
         self.held
     }
 
+    /// Whether its start waits because it restarts again and again.
+    pub(super) fn is_held_back(&self) -> bool {
+        self.quiet_until.is_some()
+    }
+
     /// Whether a lost node is to be reset when it comes back.
     pub(super) fn resets_on_recovery(&self) -> bool {
         self.settings.reset_on_recovery
     }
 
-    /// A boot-up message: what was under way is void.
-    pub(super) fn handle_boot_up(&mut self, now: Instant) {
+    /// A boot-up message: what was under way is void. `true`: it was one too many, from now on the start waits.
+    pub(super) fn handle_boot_up(&mut self, now: Instant) -> bool {
         self.cancel();
-        if self.settings.auto_start && !self.held {
-            self.phase = Phase::Booting(now + self.settings.delay);
+        if !self.settings.auto_start || self.held {
+            return false;
         }
+        self.quiet_until = self.quiet_until.filter(|until| now < *until);
+        let storm = self.quiet_until.is_none() && self.boots_too_often(now);
+        if storm {
+            self.quiet_until = Some(now + STORM_WAIT);
+        }
+        self.phase = Phase::Booting(self.quiet_until.unwrap_or(now + self.settings.delay));
+        storm
+    }
+
+    fn boots_too_often(&mut self, now: Instant) -> bool {
+        self.boots.rotate_left(1);
+        if let Some(newest) = self.boots.last_mut() {
+            *newest = Some(now);
+        }
+        let often = self.boots.iter().all(|boot| boot.is_some_and(|at| now.since(at) <= STORM_WINDOW));
+        if often {
+            self.boots = [None; STORM_BOOTS];
+        }
+        often
     }
 
     /// The node reports pre-operational or stopped. `true`: a start command is due now (R-DET-017).
-    pub(super) fn handle_idle_node(&self) -> bool {
-        self.settings.auto_start && !self.held && !matches!(self.phase, Phase::Sent(_))
+    pub(super) fn handle_idle_node(&self, now: Instant) -> bool {
+        let held_back = self.quiet_until.is_some_and(|until| now < until);
+        self.settings.auto_start && !self.held && !held_back && !matches!(self.phase, Phase::Sent(_))
     }
 
     /// The node is operational, or sends TPDOs. `true`: after a failed start.
@@ -75,6 +119,7 @@ impl Start {
 
     /// A start command was sent.
     pub(super) fn sent(&mut self, now: Instant) {
+        self.quiet_until = None;
         self.attempts = self.attempts.saturating_add(1);
         let wait = if self.attempts == 1 { self.settings.confirm } else { self.settings.retry };
         self.phase = Phase::Sent(now + wait);
@@ -104,12 +149,16 @@ impl Start {
     pub(super) fn hold(&mut self) {
         self.cancel();
         self.held = true;
+        self.failed = false;
+        self.quiet_until = None;
     }
 
     /// An operator starts the node.
     pub(super) fn release(&mut self) {
         self.cancel();
         self.held = false;
+        self.failed = false;
+        self.quiet_until = None;
     }
 
     /// The bus cannot be used.
@@ -167,9 +216,9 @@ mod tests {
     #[test]
     fn r_det_020_start_is_repeated_and_fails_after_three_unanswered_commands() {
         let mut start = Start::new(StartSettings::default());
-        assert!(start.handle_idle_node());
+        assert!(start.handle_idle_node(at(0)));
         start.sent(at(0));
-        assert!(!start.handle_idle_node(), "one command at a time");
+        assert!(!start.handle_idle_node(at(0)), "one command at a time");
         assert_eq!(due(&mut start, 999), None);
         for (millis, failed) in [(1000, None), (2000, None), (3000, Some(3)), (4000, None), (5000, None)] {
             assert_eq!(due(&mut start, millis), Some(StartDue { failed }), "at {millis}");
@@ -185,27 +234,57 @@ mod tests {
         let mut start = Start::new(StartSettings::default());
         start.handle_boot_up(at(100));
         assert_eq!(start.poll_timeout(), Some((at(600), "start after boot-up")));
-        assert!(start.handle_idle_node(), "a report of pre-operational starts at once");
+        assert!(start.handle_idle_node(at(0)), "a report of pre-operational starts at once");
         assert_eq!(due(&mut start, 599), None);
         assert_eq!(due(&mut start, 600), DUE);
+    }
+
+    #[test]
+    fn f14_a_node_that_boots_three_times_within_ten_seconds_is_started_after_thirty_seconds() {
+        let mut start = Start::new(StartSettings::default());
+        assert!(!start.handle_boot_up(at(0)));
+        assert!(!start.handle_boot_up(at(1000)));
+        assert!(start.handle_boot_up(at(2000)), "the third");
+        assert!(!start.handle_boot_up(at(3000)), "told once");
+        assert!(!start.handle_idle_node(at(3100)));
+        assert_eq!(start.poll_timeout(), Some((at(32_000), "start after boot-up")));
+        assert_eq!(due(&mut start, 32_000), DUE);
+        start.sent(at(32_000));
+        assert!(!start.is_held_back());
+        assert!(!start.handle_boot_up(at(33_000)), "counted anew");
+        assert!(!start.handle_boot_up(at(60_000)), "seldom enough");
+        assert!(!start.handle_boot_up(at(90_000)));
+        assert!(start.handle_idle_node(at(90_100)));
+    }
+
+    #[test]
+    fn r_det_020_a_failed_start_is_told_again_after_an_operator_ordered_another() {
+        let mut start = Start::new(StartSettings::default());
+        for ordered_at in [0, 60_000] {
+            start.release();
+            for attempt in 0..3 {
+                start.sent(at(ordered_at + 1000 * attempt));
+            }
+            assert_eq!(due(&mut start, ordered_at + 3000), Some(StartDue { failed: Some(3) }));
+        }
     }
 
     #[test]
     fn r_det_017_a_node_that_an_operator_stopped_stays_stopped() {
         let mut start = Start::new(StartSettings::default());
         start.hold();
-        assert!(!start.handle_idle_node());
+        assert!(!start.handle_idle_node(at(0)));
         start.handle_boot_up(at(0));
         assert_eq!(start.poll_timeout(), None);
         start.release();
-        assert!(start.handle_idle_node());
+        assert!(start.handle_idle_node(at(0)));
     }
 
     #[test]
     fn r_det_017_without_auto_start_nothing_is_started() {
         let mut start = Start::new(StartSettings { auto_start: false, ..StartSettings::default() });
         start.handle_boot_up(at(0));
-        assert!(!start.handle_idle_node());
+        assert!(!start.handle_idle_node(at(0)));
         assert_eq!(start.poll_timeout(), None);
     }
 

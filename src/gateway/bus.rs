@@ -79,9 +79,9 @@ impl Bus {
         }
     }
 
-    /// Whether frames can come; so it is taken to be until the bus says otherwise.
+    /// Whether frames can come; not before the bus says so.
     pub(super) fn is_up(&self) -> bool {
-        self.link.is_none_or(Link::is_up)
+        self.link.is_some_and(Link::is_up)
     }
 
     /// When it has been silent for too long, if no frame comes until then.
@@ -133,11 +133,6 @@ impl Gateway {
         expected.count() > 1
     }
 
-    pub(super) fn is_master_of(&self, node: NodeIndex) -> bool {
-        let bus = self.table.nodes.get(node.0).and_then(|node| self.buses.get(node.bus.0));
-        bus.is_some_and(|bus| bus.role == Role::Master)
-    }
-
     pub(super) fn bus_frame(&mut self, now: Now, index: BusIndex, frame: &CanFrame) {
         let was_quiet = self.quiet_until(now, index).is_some();
         let Some(bus) = self.buses.get_mut(index.0) else { return };
@@ -160,22 +155,16 @@ impl Gateway {
             return;
         }
         let (was_up, before) = (bus.is_up(), bus.status.state);
-        let first = bus.link.replace(link).is_none();
+        bus.link = Some(link);
         bus.status.state = state(link);
         let (after, up) = (bus.status.state, bus.is_up());
         if up != was_up {
             bus.heard_at = now.instant;
             bus.silent = false;
-        }
-        if first && up {
-            // What was asked before the interface was open did not leave: all nodes are asked now (R-DET-046).
-            bus.network.handle_link(now, false);
-        }
-        if up != was_up || first {
             bus.network.handle_link(now, up);
         }
         let never_heard = bus.counters.frames_received == 0;
-        let members = if was_up && !up { bus.members.clone() } else { Vec::new() };
+        let members = if up { Vec::new() } else { bus.members.clone() };
         self.dirty_buses.mark(index.0);
         self.tell_bus(now, index, "bus_state", |event| {
             before.word().clone_into(&mut event.from);
@@ -207,12 +196,9 @@ impl Gateway {
     pub(super) fn bus_not_sent(&mut self, now: Now, index: BusIndex, frame: &CanFrame) {
         let Some(bus) = self.buses.get_mut(index.0) else { return };
         bus.network.handle_not_sent(now, frame);
-        // Before the interface is open nothing can leave, and that is no news.
-        if bus.link.is_some() {
-            self.tell_bus(now, index, "frame_not_sent", |event| {
-                event.text = format!("{frame} did not leave");
-            });
-        }
+        self.tell_bus(now, index, "frame_not_sent", |event| {
+            event.text = format!("{frame} did not leave");
+        });
         self.drain_network(now, index);
     }
 

@@ -319,7 +319,9 @@ mod tests {
         fn new(table: TagTable) -> Self {
             let gateway = Gateway::new(Arc::new(table), Now::from_millis(0));
             let image = gateway.empty_image();
-            Self { gateway, image }
+            let mut bench = Self { gateway, image };
+            bench.link(0, Link::ErrorActive);
+            bench
         }
 
         fn bus(&mut self, event: BusEvent) {
@@ -415,15 +417,15 @@ mod tests {
     }
 
     #[test]
-    fn r_det_046_nodes_are_asked_at_once_when_the_interface_is_open() {
-        let mut bench = Bench::new(fixture::table());
-        let request: CanFrame = "701#R1".parse().unwrap();
-        bench.run_to(1);
-        bench.bus(BusEvent::NotSent { frame: request, at: Now::from_millis(1) });
-        bench.link(30, Link::ErrorActive);
-        bench.gateway.handle_timeout(Now::from_millis(30));
-        assert_eq!(bench.gateway.poll_output(), Some(Output::Transmit { bus: BUS, frame: request }));
-        assert!(!bench.events().contains(&"frame_not_sent"), "{:?}", bench.events());
+    fn r_det_046_nodes_are_asked_at_once_when_the_bus_can_be_used_and_not_before() {
+        let mut gateway = Gateway::new(Arc::new(fixture::table()), Now::from_millis(0));
+        gateway.handle_timeout(Now::from_millis(5_000));
+        assert_eq!(gateway.poll_output(), None);
+        let event = BusEvent::Link { link: Link::ErrorActive, at: Now::from_millis(6_000) };
+        gateway.handle_input(Now::from_millis(6_000), Input::Bus { bus: BUS, event });
+        gateway.handle_timeout(Now::from_millis(6_000));
+        let request = Output::Transmit { bus: BUS, frame: "701#R1".parse().unwrap() };
+        assert_eq!(std::iter::from_fn(|| gateway.poll_output()).collect::<Vec<_>>(), [request]);
     }
 
     #[test]

@@ -20,12 +20,18 @@ pub(super) struct Node {
     pub(super) lost: Option<Loss>,
     /// Start commands without effect.
     pub(super) start_failed: Option<u32>,
+    /// It restarts again and again, so that its start waits.
+    pub(super) start_held_back: bool,
     pub(super) stop_ordered: bool,
     /// A frame came at any time since the gateway started.
     pub(super) ever_seen: bool,
     /// The journal tells that it was lost.
     pub(super) told_lost: bool,
     pub(super) duplicate: bool,
+    /// It told its state since it was lost or the bus could not be used.
+    pub(super) supervised: bool,
+    /// Somebody else guards it too.
+    pub(super) foreign_guard: bool,
     pub(super) last_toggle_error: Option<Instant>,
     /// Guard requests stay without answer: until then it will have answered, or be lost.
     pub(super) suspect_until: Option<Instant>,
@@ -59,10 +65,13 @@ impl Node {
             never_seen: false,
             lost: None,
             start_failed: None,
+            start_held_back: false,
             stop_ordered: false,
             ever_seen: false,
             told_lost: false,
             duplicate: false,
+            supervised: false,
+            foreign_guard: false,
             last_toggle_error: None,
             suspect_until: None,
             fresh_until: vec![None; pdos.len()],
@@ -85,6 +94,7 @@ impl Node {
     /// Its bus cannot be used any more: whether it is there is not known until a frame comes.
     pub(super) fn lose_contact(&mut self) {
         self.contact = false;
+        self.supervised = false;
         self.suspect_until = None;
     }
 
@@ -144,6 +154,9 @@ impl Node {
         if let Some(attempts) = self.start_failed {
             return format!("{attempts} start commands had no effect");
         }
+        if self.start_held_back {
+            return "restarts again and again; its start waits".to_owned();
+        }
         match self.nmt {
             Some(NmtState::Stopped) if self.stop_ordered => return "stopped by a command".to_owned(),
             Some(state @ (NmtState::Stopped | NmtState::PreOperational | NmtState::Initialising)) => {
@@ -184,7 +197,7 @@ impl Gateway {
         let status = &mut node.status;
         status.online = node.contact && node.lost.is_none() && bus_trouble.is_none();
         status.nmt = node.nmt.filter(|_| status.online);
-        status.supervised = status.nmt.is_some() && is_watched(def);
+        status.supervised = status.online && node.supervised;
         node.status.reason = node.reason(def, bus_trouble.as_deref());
         self.dirty_nodes.mark(index.0);
 
@@ -192,11 +205,13 @@ impl Gateway {
         let suspect_until = node.suspect_until.filter(|until| *until > now.instant);
         // A node that never was there was not lost: that has an alarm of its own, which names other causes.
         let (lost, never_seen) = (node.lost.is_some() && node.ever_seen, node.never_seen);
-        let (start_failed, duplicate) = (node.start_failed.is_some(), node.duplicate);
+        let start_failed = node.start_failed.is_some() || node.start_held_back;
+        let (duplicate, foreign_guard) = (node.duplicate, node.foreign_guard);
         self.raise(now, owner, BuiltIn::NodeLost, lost, quiet_until);
         self.conditions.set(now, owner, BuiltIn::NodeNeverSeen, never_seen);
         self.conditions.set(now, owner, BuiltIn::NotOperational, start_failed);
         self.conditions.set(now, owner, BuiltIn::DuplicateNode, duplicate);
+        self.conditions.set(now, owner, BuiltIn::ForeignGuardMaster, foreign_guard);
         let pdos = self.nodes.get(index.0).map_or(0, |node| node.status.pdos.len());
         for pdo in 0..pdos {
             let status = self.nodes.get(index.0).and_then(|node| node.status.pdos.get(pdo));

@@ -39,7 +39,25 @@ impl Gateway {
             NodeEvent::ToggleError { consecutive } => self.toggle_error(at, consecutive),
             NodeEvent::Lost { stuck_toggle } => self.lost(at, stuck_toggle),
             NodeEvent::Recovered => self.recovered(at),
-            NodeEvent::ForeignGuardMaster => self.foreign_guard_master(at),
+            NodeEvent::Supervised => self.change(index, |node| node.supervised = true),
+            NodeEvent::ForeignGuardMaster => {
+                self.change(index, |node| node.foreign_guard = true);
+                self.tell(at, "foreign_guard_master", |event| {
+                    event.text =
+                        "somebody else sends guard requests to this node; both see wrong toggle bits".into();
+                });
+            }
+            NodeEvent::ForeignGuardMasterGone => {
+                self.change(index, |node| node.foreign_guard = false);
+                self.tell(at, "foreign_guard_master_gone", |_| ());
+            }
+            NodeEvent::StartHeldBack { wait } => {
+                self.change(index, |node| node.start_held_back = true);
+                self.tell(at, "start_held_back", |event| {
+                    event.text =
+                        format!("it restarts again and again; its next start waits {} s", wait.as_secs());
+                });
+            }
             NodeEvent::DuplicateSuspected { evidence } => self.duplicate_suspected(at, evidence),
             NodeEvent::DuplicateCleared => {
                 self.change(index, |node| node.duplicate = false);
@@ -193,6 +211,7 @@ impl Gateway {
             node.nmt = Some(to);
             if operational {
                 node.start_failed = None;
+                node.start_held_back = false;
             } else {
                 node.clear_stale_pdos();
             }
@@ -242,7 +261,9 @@ impl Gateway {
         };
         let mut before = None;
         self.change(index, |node| before = node.last_toggle_error.replace(now.instant));
-        if before.is_some_and(|before| now.instant.since(before) <= guard_time * TOGGLE_WINDOW) {
+        // Errors in a row may be a stuck toggle bit, which loses the node and is told by that.
+        let single = consecutive <= 1;
+        if single && before.is_some_and(|before| now.instant.since(before) <= guard_time * TOGGLE_WINDOW) {
             self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::GuardToggle);
         }
         self.suspect(now, index, consecutive);
@@ -267,6 +288,7 @@ impl Gateway {
         let mut was_there = false;
         self.change(index, |node| {
             node.lost = Some(loss);
+            node.supervised = false;
             node.suspect_until = None;
             node.told_lost = node.ever_seen;
             was_there = node.ever_seen;
@@ -292,15 +314,6 @@ impl Gateway {
         }
     }
 
-    fn foreign_guard_master(&mut self, at: (Now, NodeIndex)) {
-        if self.is_master_of(at.1) {
-            self.conditions.pulse(at.0, AlarmOwner::Node(at.1), BuiltIn::ForeignGuardMaster);
-        }
-        self.tell(at, "foreign_guard_master", |event| {
-            event.text = "somebody else sends guard requests to this node; both see wrong toggle bits".into();
-        });
-    }
-
     fn duplicate_suspected(&mut self, at: (Now, NodeIndex), evidence: &'static str) {
         self.change(at.1, |node| node.duplicate = true);
         self.degrade(at.0, at.1, None, Quality::Uncertain(Reason::DuplicateNode));
@@ -315,6 +328,7 @@ impl Gateway {
             NmtRequest::Stop | NmtRequest::EnterPreOperational => {
                 node.stop_ordered = true;
                 node.start_failed = None;
+                node.start_held_back = false;
             }
             NmtRequest::ResetNode | NmtRequest::ResetCommunication => {}
         });

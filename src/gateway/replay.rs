@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use super::{Gateway, Input};
-use crate::can::{BusEvent, BusIndex, CanFrame};
+use crate::can::{BusEvent, BusIndex, CanFrame, Link};
 use crate::canopen::Role;
 use crate::mapping::TagTable;
 use crate::process_image::{Event, NodeIndex, ProcessImage, TagIndex, Value};
@@ -69,7 +69,7 @@ impl<I: Iterator<Item = (Now, CanFrame)>> Iterator for Replay<I> {
 impl<I> Replay<I> {
     fn frame(&mut self, at: Now, frame: CanFrame) {
         let Self { table, bus, core, lines, .. } = self;
-        let core = core.get_or_insert_with(|| Core::new(table, at));
+        let core = core.get_or_insert_with(|| Core::new(table, *bus, at));
         while let Some((due, _)) = core.gateway.poll_timeout()
             && due <= at.instant
         {
@@ -84,10 +84,20 @@ impl<I> Replay<I> {
 }
 
 impl Core {
-    fn new(table: &Arc<TagTable>, start: Now) -> Self {
-        let gateway = Gateway::new(Arc::clone(table), start);
-        let image = gateway.empty_image();
-        Self { gateway, image, online: vec![false; table.nodes.len()], seq: 0, start }
+    fn new(table: &Arc<TagTable>, bus: BusIndex, start: Now) -> Self {
+        let mut gateway = Gateway::new(Arc::clone(table), start);
+        // A bus from which frames were recorded was up; of others nothing is known.
+        let link = BusEvent::Link { link: Link::ErrorActive, at: start };
+        gateway.handle_input(start, Input::Bus { bus, event: link });
+        let mut core = Self {
+            image: gateway.empty_image(),
+            gateway,
+            online: vec![false; table.nodes.len()],
+            seq: 0,
+            start,
+        };
+        core.publish(table, start, &mut VecDeque::new());
+        core
     }
 
     /// A moment between frames on both clocks.

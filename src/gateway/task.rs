@@ -148,8 +148,9 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
+    use crate::can::Link;
     use crate::gateway::{Action, CommandSource, fixture};
-    use crate::process_image::{AlarmIndex, ImageReader, NodeIndex, Quality, Value, process_image};
+    use crate::process_image::{AlarmIndex, BusState, ImageReader, NodeIndex, Quality, Value, process_image};
 
     struct Ends {
         events: mpsc::Sender<(BusIndex, BusEvent)>,
@@ -181,6 +182,8 @@ mod tests {
             clock,
             stop.clone(),
         ));
+        let up = BusEvent::Link { link: Link::ErrorActive, at: clock.now() };
+        events.try_send((BusIndex(0), up)).unwrap();
         Ends { events, frames, commands, health, reader, clock, stop, task }
     }
 
@@ -224,6 +227,7 @@ mod tests {
         let mut ends = start(64);
         let action = Action::Nmt { node: NodeIndex(0), request: crate::canopen::NmtRequest::Stop };
         let command = Command { id: 7, source: CommandSource::Web("test".into()), action };
+        ends.until(|image| image.buses[0].state == BusState::ErrorActive).await;
         let (reply, answer) = oneshot::channel();
         ends.commands.send((command, reply)).await.unwrap();
         assert_eq!(answer.await.unwrap(), Outcome::Done);

@@ -17,9 +17,9 @@ pub(super) struct Bench {
 }
 
 impl Bench {
-    /// At time 0.
+    /// At time 0, on a bus that can be used.
     pub(super) fn new(settings: NetworkSettings) -> Self {
-        Self { network: Network::new(settings, Now::from_millis(0)), lines: Vec::new(), now: 0 }
+        Self { network: usable(settings), lines: Vec::new(), now: 0 }
     }
 
     /// Runs all timers up to and including `millis`.
@@ -80,7 +80,8 @@ impl Bench {
         while let Some(output) = self.network.poll_output() {
             let text = match output {
                 NetworkOutput::Transmit(frame) => frame.to_string(),
-                NetworkOutput::Node(_, NodeEvent::FrameSeen) => continue,
+                // Of every frame, and of every node: they have tests of their own.
+                NetworkOutput::Node(_, NodeEvent::FrameSeen | NodeEvent::Supervised) => continue,
                 NetworkOutput::Node(_, event) => format!("{event:?}"),
                 NetworkOutput::Foreign(event) => format!("{event:?}"),
             };
@@ -97,6 +98,13 @@ impl Bench {
     pub(super) fn take_those_with(&mut self, word: &str) -> Vec<String> {
         self.take().into_iter().filter(|line| line.contains(word)).collect()
     }
+}
+
+/// A network at time 0, on a bus that can be used.
+pub(super) fn usable(settings: NetworkSettings) -> Network {
+    let mut network = Network::new(settings, Now::from_millis(0));
+    network.handle_link(Now::from_millis(0), true);
+    network
 }
 
 /// A DetCon: four TPDOs of 8, 8, 8 and 6 bytes, guarded every 500 ms.

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use super::bench::{Bench, detcon, master, mute, passive, running, running_with};
+use super::bench::{Bench, detcon, master, mute, passive, running, running_with, usable};
 use crate::canopen::{
-    ErrorControl, GuardingSettings, Network, NetworkOutput, NetworkSettings, NmtRequest, NodeId,
-    NodeSettings, StartSettings,
+    ErrorControl, GuardingSettings, NetworkOutput, NetworkSettings, NmtRequest, NodeId, NodeSettings,
+    StartSettings,
 };
 use crate::time::Now;
 
@@ -151,10 +151,7 @@ fn commands_for_unknown_nodes_or_in_the_passive_role_are_refused() {
 
 #[test]
 fn v_det_01_r_det_010_an_operators_command_to_all_is_one_frame() {
-    let mut network = Network::new(
-        master(vec![mute(), NodeSettings { id: NodeId::new(2).unwrap(), ..mute() }]),
-        Now::from_millis(0),
-    );
+    let mut network = usable(master(vec![mute(), NodeSettings { id: NodeId::new(2).unwrap(), ..mute() }]));
     assert!(network.request_nmt(Now::from_millis(0), None, NmtRequest::Stop));
     let told: Vec<_> = std::iter::from_fn(|| network.poll_output()).collect();
     assert_eq!(told[0], NetworkOutput::Transmit("000#0200".parse().unwrap()));
@@ -296,7 +293,7 @@ fn r_det_037_and_083_tpdos_of_a_lost_node_change_no_state_and_recover_nothing() 
 #[test]
 fn r_det_046_every_node_is_asked_at_once_and_requests_do_not_burst() {
     let nodes = (1..=127).map(|id| NodeSettings { id: NodeId::new(id).unwrap(), ..mute() }).collect();
-    let mut network = Network::new(master(nodes), Now::from_millis(0));
+    let mut network = usable(master(nodes));
     let mut sent = Vec::new();
     for millis in 0..500 {
         network.handle_timeout(Now::from_millis(millis));

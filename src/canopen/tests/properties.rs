@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use proptest::prelude::*;
 
-use super::bench::{detcon, master};
+use super::bench::{detcon, master, usable};
 use crate::can::{CanFrame, CanId};
 use crate::canopen::{
     ErrorControl, GuardingSettings, Network, NetworkOutput, NetworkSettings, NmtRequest, NmtState, NodeEvent,
@@ -125,7 +125,7 @@ proptest! {
         settings in any_network(),
         steps in prop::collection::vec(any_step(), 1..200),
     ) {
-        let mut network = Network::new(settings.clone(), Now::from_millis(0));
+        let mut network = usable(settings.clone());
         let mut clock = 0;
         for step in &steps {
             for output in take(&mut network, &mut clock, step) {
@@ -142,7 +142,7 @@ proptest! {
         settings in any_network(),
         steps in prop::collection::vec(any_step(), 1..200),
     ) {
-        let mut network = Network::new(settings, Now::from_millis(0));
+        let mut network = usable(settings);
         let mut clock = 0;
         for step in &steps {
             take(&mut network, &mut clock, step);
@@ -163,7 +163,7 @@ proptest! {
         settings in any_network(),
         steps in prop::collection::vec(any_step(), 1..200),
     ) {
-        let mut network = Network::new(settings, Now::from_millis(0));
+        let mut network = usable(settings);
         let mut clock = 0;
         let mut lost = BTreeSet::new();
         for step in &steps {
@@ -182,7 +182,7 @@ proptest! {
         settings in any_network(),
         steps in prop::collection::vec(any_step(), 1..200),
     ) {
-        let mut network = Network::new(settings, Now::from_millis(0));
+        let mut network = usable(settings);
         let mut clock = 0;
         let mut state = [None::<NmtState>; 3];
         for step in &steps {
@@ -220,7 +220,7 @@ impl Device {
 #[test]
 fn a_day_of_quiet_guarding_passes_without_a_word() {
     const DAY: u64 = 24 * 3600 * 1000;
-    let mut network = Network::new(master(vec![detcon(1)]), Now::from_millis(0));
+    let mut network = usable(master(vec![detcon(1)]));
     let mut device = Device { toggle: true, operational: false };
     let pdos: Vec<CanFrame> =
         ["181#0000000000000000", "281#0000000000000000", "381#0080FF0F000099CC", "481#0019FF800301"]
@@ -258,6 +258,7 @@ fn a_day_of_quiet_guarding_passes_without_a_word() {
         told,
         [
             "0 Seen",
+            "0 Supervised",
             "0 State { from: None, to: PreOperational, ordered: true }",
             "0 NmtSent { request: Start }",
             "7 State { from: Some(PreOperational), to: Operational, ordered: true }",

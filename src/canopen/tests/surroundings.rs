@@ -1,7 +1,10 @@
 //! What comes from outside: other masters, strangers, two nodes with one id, a bus that fails; and the passive role.
 
-use super::bench::{Bench, detcon, master, mute, passive, running, running_with};
-use crate::canopen::{ErrorControl, GuardingSettings, NmtRequest, NodeId, NodeSettings};
+use super::bench::{Bench, detcon, master, mute, passive, running, running_with, usable};
+use crate::canopen::{
+    ErrorControl, GuardingSettings, Network, NetworkOutput, NmtRequest, NodeEvent, NodeId, NodeSettings,
+    StartSettings,
+};
 use crate::time::Now;
 
 #[test]
@@ -84,6 +87,77 @@ fn a_request_that_did_not_leave_is_no_miss() {
     }
     bench.run(5499);
     assert!(bench.take().iter().all(|line| line.ends_with("701#R1")));
+}
+
+#[test]
+fn nothing_is_asked_and_nobody_blamed_before_the_bus_can_be_used() {
+    let mut network = Network::new(master(vec![detcon(1), mute()]), Now::from_millis(0));
+    assert_eq!(network.poll_timeout(), None);
+    network.handle_link(Now::from_millis(60_000), true);
+    network.handle_timeout(Now::from_millis(60_000));
+    let told: Vec<_> = std::iter::from_fn(|| network.poll_output()).collect();
+    assert_eq!(told, [NetworkOutput::Transmit("701#R1".parse().unwrap())]);
+}
+
+#[test]
+fn a_command_that_did_not_leave_is_as_if_it_had_not_been_given() {
+    let mut bench = running();
+    assert!(bench.request(100, 1, NmtRequest::Stop));
+    bench.not_sent(101, "000#0201").take();
+    bench.frame(600, "701#7F");
+    assert_eq!(
+        bench.take_those_with("Sent"),
+        ["600 NmtSent { request: Start }"],
+        "it is not held back, and its supervision went on"
+    );
+    let mut waiting = running_with(mute());
+    waiting.frame(600, "701#FF").not_sent(601, "000#0101");
+    waiting.run(1500);
+    assert!(waiting.take_those_with("PdoTimeout").is_empty(), "a start that did not leave promises no TPDO");
+}
+
+#[test]
+fn a_frame_that_is_handed_over_after_the_bus_went_down_sets_no_clock_going() {
+    let mut bench = running();
+    bench.link(400, false).frame(401, "701#FF").frame(402, "181#0000000000000000").run(60_000);
+    let lines = bench.take();
+    assert!(!lines.iter().any(|line| line.contains("000#") || line.contains("Timeout")), "{lines:?}");
+}
+
+#[test]
+fn the_first_tpdo_of_a_node_that_starts_by_itself_is_no_surprise() {
+    let start = StartSettings { auto_start: false, ..StartSettings::default() };
+    let mut bench = running_with(NodeSettings { start, ..mute() });
+    bench.frame(200, "701#00").frame(300, "181#0000000000000000");
+    assert!(bench.take_those_with("Unexpected").is_empty());
+}
+
+#[test]
+fn a_node_is_supervised_from_its_first_state_on_and_not_after_a_boot_up_a_tpdo_or_a_loss() {
+    let mut network = usable(master(vec![mute()]));
+    let mut told = Vec::new();
+    let mut take = |network: &mut Network, millis: u64, frame: Option<&str>| {
+        let now = Now::from_millis(millis);
+        network.handle_timeout(now);
+        if let Some(frame) = frame {
+            network.handle_frame(now, &frame.parse().unwrap());
+        }
+        let is_told = |output| output == NetworkOutput::Node(NodeId::new(1).unwrap(), NodeEvent::Supervised);
+        told.extend(
+            std::iter::from_fn(|| network.poll_output())
+                .filter_map(|output| is_told(output).then_some(millis)),
+        );
+    };
+    take(&mut network, 0, Some("701#00"));
+    take(&mut network, 1, Some("181#0000000000000000"));
+    take(&mut network, 501, Some("701#05"));
+    take(&mut network, 1001, Some("701#85"));
+    for millis in (1500..10_000).step_by(100) {
+        take(&mut network, millis, None);
+    }
+    take(&mut network, 10_000, Some("181#0000000000000000"));
+    take(&mut network, 10_050, Some("701#05"));
+    assert_eq!(told, [501, 10_050]);
 }
 
 #[test]

@@ -412,7 +412,10 @@ fn r_det_043_a_foreign_guard_request_is_told_until_60_s_of_silence() {
     }
     assert_eq!(bench.take_those_with("Foreign"), ["1250 ForeignGuardMaster"]);
     bench.frame(160_251, "701#R1");
-    assert_eq!(bench.take_those_with("Foreign"), ["160251 ForeignGuardMaster"]);
+    assert_eq!(
+        bench.take_those_with("Foreign"),
+        ["160250 ForeignGuardMasterGone", "160251 ForeignGuardMaster"]
+    );
 }
 
 #[test]
