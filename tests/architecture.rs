@@ -21,6 +21,8 @@ const MAY_IMPORT: &[(&str, &[&str])] = &[
             "canopen",
             "can::BusIndex",
             "can::CanId",
+            "can::BIT_RATES",
+            "can::DEFAULT_BIT_RATE",
         ],
     ),
     ("alarms", &["process_image", "time"]),

@@ -4,17 +4,10 @@ use super::interface::Interface;
 use super::slcan_port::{self, SlcanReader, SlcanWriter};
 use super::socketcan::{self, SocketReader, SocketWriter};
 use super::virtual_bus::{self, VirtualReader, VirtualWriter};
-use super::{BusError, BusEvent, BusReader, BusWriter, CanBus, CanFrame, Tally};
+use super::{BusError, BusEvent, BusReader, BusWriter, CanFrame, Tally};
 use crate::time::Clock;
 
-/// An open bus of any kind.
-#[derive(Debug)]
-pub struct AnyBus {
-    reader: AnyReader,
-    writer: AnyWriter,
-}
-
-/// The receiving half of [`AnyBus`].
+/// The receiving half of a bus of any kind.
 #[derive(Debug)]
 pub enum AnyReader {
     /// An interface of the host.
@@ -25,7 +18,7 @@ pub enum AnyReader {
     Virtual(VirtualReader),
 }
 
-/// The sending half of [`AnyBus`].
+/// The sending half of a bus of any kind.
 #[derive(Debug)]
 pub enum AnyWriter {
     /// An interface of the host.
@@ -42,48 +35,21 @@ pub enum AnyWriter {
 ///
 /// # Errors
 /// The interface is not there, or the system refuses it.
-pub fn open(interface: &Interface, clock: Clock) -> Result<AnyBus, BusError> {
-    match interface {
+pub fn open(interface: &Interface, clock: Clock) -> Result<(AnyReader, AnyWriter), BusError> {
+    Ok(match interface {
         Interface::SocketCan(name) => {
             let (reader, writer) = socketcan::open(name, clock)?;
-            Ok(AnyBus { reader: AnyReader::SocketCan(reader), writer: AnyWriter::SocketCan(writer) })
+            (AnyReader::SocketCan(reader), AnyWriter::SocketCan(writer))
         }
         Interface::Virtual(name) => {
-            let (reader, writer) = virtual_bus::join(name, clock).split();
-            Ok(AnyBus { reader: AnyReader::Virtual(reader), writer: AnyWriter::Virtual(writer) })
+            let (reader, writer) = virtual_bus::join(name, clock);
+            (AnyReader::Virtual(reader), AnyWriter::Virtual(writer))
         }
         Interface::Slcan { .. } | Interface::SlcanTcp { .. } => {
             let (reader, writer) = slcan_port::open(interface, clock);
-            Ok(AnyBus { reader: AnyReader::Slcan(reader), writer: AnyWriter::Slcan(writer) })
+            (AnyReader::Slcan(reader), AnyWriter::Slcan(writer))
         }
-    }
-}
-
-impl AnyBus {
-    /// Waits for what happens next, as [`BusReader::recv`].
-    ///
-    /// # Errors
-    /// The bus is unusable and has to be opened again.
-    pub async fn recv(&mut self) -> Result<BusEvent, BusError> {
-        self.reader.recv().await
-    }
-
-    /// Sends a frame, as [`BusWriter::send`].
-    ///
-    /// # Errors
-    /// The frame did not leave.
-    pub async fn send(&mut self, frame: &CanFrame) -> Result<(), BusError> {
-        self.writer.send(frame).await
-    }
-}
-
-impl CanBus for AnyBus {
-    type Reader = AnyReader;
-    type Writer = AnyWriter;
-
-    fn split(self) -> (AnyReader, AnyWriter) {
-        (self.reader, self.writer)
-    }
+    })
 }
 
 impl BusReader for AnyReader {

@@ -12,18 +12,18 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// The bit rates, in bit/s, that a LAWICEL adapter knows, in the order of its commands `S0` to `S8`.
-/// They are also those of R-DET-089.
+/// The bit rates of CANopen in bit/s (R-DET-089), which are those that a LAWICEL adapter knows, in the order of its
+/// commands `S0` to `S8`.
 pub const BIT_RATES: [u32; 9] =
     [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
 
-/// The bit rate, in bit/s, of a serial adapter for which none is written (R-DET-089).
+/// The bit rate, in bit/s, of a bus or of a serial adapter for which none is written (R-DET-089).
 pub const DEFAULT_BIT_RATE: u32 = 125_000;
 
 /// The speed, in baud, of a serial port for which none is written. Adapters on USB ignore it.
 pub const DEFAULT_BAUD: u32 = 115_200;
 
-/// The longest name of a network interface in Linux (`IFNAMSIZ` less the final zero).
+/// The longest name of a network interface in Linux, in bytes (`IFNAMSIZ` less the final zero).
 const LONGEST_NAME: usize = 15;
 
 /// Where a bus is reached.
@@ -145,10 +145,7 @@ fn checked_name(name: &str) -> Result<String, String> {
         return Err("the name is empty".to_owned());
     }
     if name.len() > LONGEST_NAME {
-        return Err(format!(
-            "a name has at most {LONGEST_NAME} characters and `{name}` has {}",
-            name.chars().count()
-        ));
+        return Err(format!("a name has at most {LONGEST_NAME} bytes and `{name}` has {}", name.len()));
     }
     if name.contains(['/', ':']) || name == "." || name == ".." {
         return Err("a name has no `/` or `:`, and is not `.` or `..`".to_owned());
@@ -269,6 +266,7 @@ mod tests {
             ("", "empty"),
             ("virtual:", "empty"),
             ("sixteen-letters-", "at most 15"),
+            ("förderbänder-öl", "has 18"),
             ("can/0", "no `/`"),
             ("..", "no `/`"),
             ("can 0", "blank"),

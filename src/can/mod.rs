@@ -3,7 +3,7 @@
 //! Not here: what a frame means. That is [`canopen`](crate::canopen)'s business.
 //!
 //! - [`frame`]: classical CAN frames, pure.
-//! - this file: [`BusEvent`] and the [`CanBus`] trait, the seam between a bus and the gateway.
+//! - this file: [`BusEvent`], and the traits [`BusReader`] and [`BusWriter`], the two halves of any open bus.
 //! - [`interface`]: how an interface is written (`can0`, `virtual:demo`, `slcan:/dev/ttyACM0`).
 //! - [`bus`] \[IO\]: [`open`] any interface.
 //! - [`socketcan`] \[IO\]: interfaces of the host, with [`host_link`] \[IO\] (what the host says of them) and, pure,
@@ -30,9 +30,9 @@ pub mod virtual_bus;
 
 use std::future::Future;
 
-pub use bus::{AnyBus, open};
+pub use bus::{AnyReader, AnyWriter, open};
 pub use frame::{CanFrame, CanId, ParseFrameError};
-pub use interface::{Interface, ParseInterfaceError};
+pub use interface::{BIT_RATES, DEFAULT_BIT_RATE, Interface, ParseInterfaceError};
 
 use crate::time::Now;
 
@@ -144,20 +144,7 @@ pub struct Tally {
     pub bit_rate: Option<u32>,
 }
 
-/// An open CAN bus. The only IO trait of the crate: tests put a simulated bus behind it.
-///
-/// It falls into two halves, so that receiving never waits for sending.
-pub trait CanBus: Send {
-    /// The receiving half.
-    type Reader: BusReader;
-    /// The sending half.
-    type Writer: BusWriter;
-
-    /// The two halves. The bus is closed when both are dropped.
-    fn split(self) -> (Self::Reader, Self::Writer);
-}
-
-/// The receiving half of a bus.
+/// The receiving half of a bus: receiving never waits for sending. The bus is closed when both halves are dropped.
 pub trait BusReader: Send {
     /// Waits for what happens next: frames, and changes of the link. The first event of a bus that has just been
     /// opened says how its link is; before that it may not be usable. Counters are in [`BusReader::tally`].
@@ -181,15 +168,6 @@ pub trait BusWriter: Send {
     /// # Errors
     /// The frame did not leave.
     fn send(&mut self, frame: &CanFrame) -> impl Future<Output = Result<(), BusError>> + Send;
-}
-
-impl<R: BusReader, W: BusWriter> CanBus for (R, W) {
-    type Reader = R;
-    type Writer = W;
-
-    fn split(self) -> (R, W) {
-        self
-    }
 }
 
 /// Why a bus could not be used. Printed once, by the task that owns it.

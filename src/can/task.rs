@@ -15,9 +15,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::interface::Interface;
 use super::outage::{Outage, Repeats};
-use super::{
-    BusCounters, BusError, BusEvent, BusIndex, BusReader, BusWriter, CanBus, CanFrame, Link, Tally, open,
-};
+use super::{BusCounters, BusError, BusEvent, BusIndex, BusReader, BusWriter, CanFrame, Link, Tally, open};
 use crate::time::{Clock, Instant};
 
 /// Time between a failure and the first try to open the bus again; it doubles up to the longest.
@@ -68,8 +66,8 @@ pub struct Ends {
 }
 
 /// As [`run`], on any kind of bus.
-pub async fn run_with<B: CanBus>(
-    open: impl FnMut() -> Result<B, BusError>,
+pub async fn run_with<R: BusReader, W: BusWriter>(
+    open: impl FnMut() -> Result<(R, W), BusError>,
     longest_wait: Duration,
     ends: Ends,
 ) {
@@ -159,10 +157,10 @@ impl Desk {
     }
 }
 
-async fn read_for_ever<B: CanBus>(
+async fn read_for_ever<R: BusReader, W: BusWriter>(
     desk: &Desk,
-    writer: &tokio::sync::Mutex<Option<B::Writer>>,
-    mut open: impl FnMut() -> Result<B, BusError>,
+    writer: &tokio::sync::Mutex<Option<W>>,
+    mut open: impl FnMut() -> Result<(R, W), BusError>,
     longest_wait: Duration,
 ) -> Result<std::convert::Infallible, GatewayGone> {
     let mut reports = interval(REPORT_EVERY);
@@ -171,8 +169,7 @@ async fn read_for_ever<B: CanBus>(
     let mut wait = FIRST_WAIT;
     loop {
         let error = match open() {
-            Ok(bus) => {
-                let (mut reader, opened) = bus.split();
+            Ok((mut reader, opened)) => {
                 *writer.lock().await = Some(opened);
                 let mut session = Session { desk, log: &mut log, was_up: false };
                 let error = session.read(&mut reader, &mut reports).await?;

@@ -300,7 +300,7 @@ async fn a_virtual_bus_is_run_by_the_same_task() {
     let name = "virtual:test".to_owned();
     let ends = Ends { bus: BusIndex(0), name, events, transmit: to_send, clock, stop };
     let _task = tokio::spawn(run_with(move || Ok(ours.join(clock)), Duration::from_millis(500), ends));
-    let (mut reader, mut writer) = bus.join(clock).split();
+    let (mut reader, mut writer) = bus.join(clock);
     while !matches!(told.recv().await.unwrap().1, BusEvent::Link { link: Link::ErrorActive, .. }) {}
     transmit.send(frame("000#0101")).await.unwrap();
     while !matches!(reader.recv().await.unwrap(), BusEvent::Frame { frame: heard, .. } if heard == frame("000#0101"))

@@ -10,7 +10,7 @@ use std::sync::{Mutex, PoisonError};
 
 use tokio::sync::broadcast::{self, error::RecvError};
 
-use super::{BusError, BusEvent, BusReader, BusWriter, CanBus, CanFrame, Link, Tally};
+use super::{BusError, BusEvent, BusReader, BusWriter, CanFrame, Link, Tally};
 use crate::time::Clock;
 
 /// How many frames a participant may be behind before it loses some: half a second of a full 1 Mbit/s bus.
@@ -47,9 +47,9 @@ impl VirtualBus {
         Self { frames: broadcast::Sender::new(frames.max(1)) }
     }
 
-    /// A new participant. It hears what is sent from now on.
+    /// A new participant, its two halves. It hears what is sent from now on.
     #[must_use]
-    pub fn join(&self, clock: Clock) -> VirtualParticipant {
+    pub fn join(&self, clock: Clock) -> (VirtualReader, VirtualWriter) {
         let id = NEXT_PARTICIPANT.fetch_add(1, Ordering::Relaxed);
         let reader = VirtualReader {
             id,
@@ -60,13 +60,13 @@ impl VirtualBus {
             told_link: false,
             overruns: 0,
         };
-        VirtualParticipant { reader, writer: VirtualWriter { id, bus: self.clone() } }
+        (reader, VirtualWriter { id, bus: self.clone() })
     }
 }
 
 /// Joins the bus of that name, which is made when nobody has it open and ends when the last participant leaves.
 #[must_use]
-pub fn join(name: &str, clock: Clock) -> VirtualParticipant {
+pub fn join(name: &str, clock: Clock) -> (VirtualReader, VirtualWriter) {
     // Nothing that holds this lock can panic half-way, so a poisoned registry is still a good one.
     let mut buses = BUSES.lock().unwrap_or_else(PoisonError::into_inner);
     buses.retain(|_, frames| frames.strong_count() > 0);
@@ -76,22 +76,6 @@ pub fn join(name: &str, clock: Clock) -> VirtualParticipant {
     };
     buses.insert(name.to_owned(), bus.frames.downgrade());
     bus.join(clock)
-}
-
-/// One who takes part in a virtual bus.
-#[derive(Debug)]
-pub struct VirtualParticipant {
-    reader: VirtualReader,
-    writer: VirtualWriter,
-}
-
-impl CanBus for VirtualParticipant {
-    type Reader = VirtualReader;
-    type Writer = VirtualWriter;
-
-    fn split(self) -> (VirtualReader, VirtualWriter) {
-        (self.reader, self.writer)
-    }
 }
 
 /// The receiving half of a participant.
@@ -167,9 +151,9 @@ mod tests {
     async fn everyone_hears_the_others_and_not_itself() {
         let bus = VirtualBus::default();
         let clock = Clock::start();
-        let (mut reader_a, mut writer_a) = bus.join(clock).split();
-        let (mut reader_b, mut writer_b) = bus.join(clock).split();
-        let (mut reader_c, _writer_c) = bus.join(clock).split();
+        let (mut reader_a, mut writer_a) = bus.join(clock);
+        let (mut reader_b, mut writer_b) = bus.join(clock);
+        let (mut reader_c, _writer_c) = bus.join(clock);
         writer_a.send(&frame(1)).await.unwrap();
         writer_b.send(&frame(2)).await.unwrap();
         assert_eq!(next_frame(&mut reader_a).await, frame(2));
@@ -179,15 +163,15 @@ mod tests {
 
     #[tokio::test]
     async fn the_first_event_says_that_the_link_is_up() {
-        let (mut reader, _writer) = VirtualBus::default().join(Clock::start()).split();
+        let (mut reader, _writer) = VirtualBus::default().join(Clock::start());
         assert!(matches!(reader.recv().await.unwrap(), BusEvent::Link { link: Link::ErrorActive, .. }));
     }
 
     #[tokio::test]
     async fn a_slow_participant_loses_the_oldest_frames_and_counts_them() {
         let bus = VirtualBus::with_capacity(8);
-        let (mut slow, _) = bus.join(Clock::start()).split();
-        let (_, mut writer) = bus.join(Clock::start()).split();
+        let (mut slow, _) = bus.join(Clock::start());
+        let (_, mut writer) = bus.join(Clock::start());
         for number in 0..20 {
             writer.send(&frame(number)).await.unwrap();
         }
@@ -198,10 +182,10 @@ mod tests {
     #[tokio::test]
     async fn a_name_is_one_bus_and_another_name_another() {
         let clock = Clock::start();
-        let (mut here, _w) = join("one-bus", clock).split();
-        let (mut elsewhere, _v) = join("another-bus", clock).split();
-        let (_, mut writer) = join("one-bus", clock).split();
-        let (_, mut far_writer) = join("another-bus", clock).split();
+        let (mut here, _w) = join("one-bus", clock);
+        let (mut elsewhere, _v) = join("another-bus", clock);
+        let (_, mut writer) = join("one-bus", clock);
+        let (_, mut far_writer) = join("another-bus", clock);
         writer.send(&frame(7)).await.unwrap();
         far_writer.send(&frame(8)).await.unwrap();
         assert_eq!(next_frame(&mut here).await, frame(7));

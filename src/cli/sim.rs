@@ -167,7 +167,7 @@ mod tests {
 
     use super::*;
     use crate::can::virtual_bus;
-    use crate::can::{BusEvent, BusReader, BusWriter, CanBus};
+    use crate::can::{BusEvent, BusReader, BusWriter};
 
     fn options() -> SimOptions {
         SimOptions {
@@ -182,7 +182,7 @@ mod tests {
     #[tokio::test]
     async fn a_simulated_device_boots_starts_and_takes_orders() {
         let (clock, stop) = (Clock::start(), CancellationToken::new());
-        let (mut heard, mut say) = virtual_bus::join("cli-sim-test", clock).split();
+        let (mut heard, mut say) = virtual_bus::join("cli-sim-test", clock);
         let input = Cursor::new("node 1 knock 7 on\n");
         let sim = tokio::spawn(run(options(), input, std::io::sink(), clock, stop.clone()));
         let started = async {

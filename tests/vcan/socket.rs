@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use cangate::can::task;
 use cangate::can::{
-    AnyBus, BusError, BusEvent, BusIndex, BusReader, CanBus, CanFrame, Interface, Link, open,
+    AnyReader, AnyWriter, BusError, BusEvent, BusIndex, BusReader, BusWriter, CanFrame, Interface, Link, open,
 };
 use cangate::time::Clock;
 use tokio::io::{AsyncReadExt, AsyncWriteExt, WriteHalf};
@@ -51,8 +51,8 @@ impl Vcan {
         ip(&format!("link set {} mtu 72 up", self.0));
     }
 
-    fn open(&self) -> AnyBus {
-        open(&Interface::SocketCan(self.0.to_owned()), Clock::start()).unwrap()
+    fn open(&self) -> Bus {
+        Bus::open(self.0, Clock::start())
     }
 }
 
@@ -62,18 +62,35 @@ impl Drop for Vcan {
     }
 }
 
-async fn next(bus: &mut AnyBus) -> Result<BusEvent, BusError> {
-    tokio::time::timeout(PATIENCE, bus.recv()).await.expect("nothing came")
+/// An open bus.
+struct Bus {
+    reader: AnyReader,
+    writer: AnyWriter,
 }
 
-async fn next_link(bus: &mut AnyBus) -> Link {
+impl Bus {
+    fn open(name: &str, clock: Clock) -> Self {
+        let (reader, writer) = open(&Interface::SocketCan(name.to_owned()), clock).unwrap();
+        Self { reader, writer }
+    }
+
+    async fn send(&mut self, frame: &CanFrame) -> Result<(), BusError> {
+        self.writer.send(frame).await
+    }
+}
+
+async fn next(bus: &mut Bus) -> Result<BusEvent, BusError> {
+    tokio::time::timeout(PATIENCE, bus.reader.recv()).await.expect("nothing came")
+}
+
+async fn next_link(bus: &mut Bus) -> Link {
     match next(bus).await.unwrap() {
         BusEvent::Link { link, .. } => link,
         other => panic!("{other:?} instead of a link"),
     }
 }
 
-async fn next_frame(bus: &mut AnyBus) -> CanFrame {
+async fn next_frame(bus: &mut Bus) -> CanFrame {
     match next(bus).await.unwrap() {
         BusEvent::Frame { frame, .. } => frame,
         other => panic!("{other:?} instead of a frame"),
@@ -104,7 +121,7 @@ fn a_frame_is_stamped_with_the_time_at_which_the_kernel_received_it() {
     alone(async {
         let vcan = Vcan::new("sock1");
         let clock = Clock::start();
-        let mut bus = open(&Interface::SocketCan("sock1".into()), clock).unwrap();
+        let mut bus = Bus::open("sock1", clock);
         assert_eq!(next_link(&mut bus).await, Link::ErrorActive);
         cansend(vcan.0, "181#01");
         let sent = clock.now();
@@ -201,7 +218,7 @@ fn error_frames_tell_the_state_of_the_controller() {
         assert_eq!(next_link(&mut bus).await, Link::BusOff);
         cansend(vcan.0, "20000100#0000000000000000");
         assert_eq!(next_link(&mut bus).await, Link::ErrorActive);
-        assert_eq!(bus.split().0.tally().error_frames, 1);
+        assert_eq!(bus.reader.tally().error_frames, 1);
     });
 }
 
@@ -209,7 +226,7 @@ fn error_frames_tell_the_state_of_the_controller() {
 fn r_det_006_fd_frames_are_counted_and_not_given() {
     alone(async {
         let vcan = Vcan::new("sock6");
-        let (mut reader, _writer) = vcan.open().split();
+        let Bus { mut reader, writer: _writer } = vcan.open();
         cansend(vcan.0, "181##10011223344");
         cansend(vcan.0, "181#02");
         let frame = loop {
@@ -227,7 +244,7 @@ fn p24_frames_that_the_kernel_drops_are_counted_exactly() {
     alone(async {
         let vcan = Vcan::new("sock7");
         let mut sender = vcan.open();
-        let (mut reader, _writer) = vcan.open().split();
+        let Bus { mut reader, writer: _writer } = vcan.open();
         let frame: CanFrame = "181#0011223344556677".parse().unwrap();
         let sent = 60_000_u64;
         for _ in 0..sent {
@@ -365,7 +382,7 @@ impl Drop for SerialCan {
 fn p19_the_state_of_a_controller_is_followed_from_error_frames_and_from_the_host() {
     alone(async {
         let mut serial = SerialCan::new("slcan0").await;
-        let mut bus = open(&Interface::SocketCan("slcan0".into()), Clock::start()).unwrap();
+        let mut bus = Bus::open("slcan0", Clock::start());
         assert_eq!(next_link(&mut bus).await, Link::ErrorActive);
         serial.say("sp130005\r").await;
         assert_eq!(next_link(&mut bus).await, Link::ErrorPassive);
@@ -380,7 +397,7 @@ fn p19_the_state_of_a_controller_is_followed_from_error_frames_and_from_the_host
         assert_eq!(next_link(&mut bus).await, Link::Down);
         tokio::task::spawn_blocking(|| ip("link set slcan0 up")).await.unwrap();
         assert_eq!(next_link(&mut bus).await, Link::ErrorActive);
-        assert_eq!(bus.split().0.tally().bit_rate, Some(500_000));
+        assert_eq!(bus.reader.tally().bit_rate, Some(500_000));
     });
 }
 
@@ -388,7 +405,7 @@ fn p19_the_state_of_a_controller_is_followed_from_error_frames_and_from_the_host
 fn p20_a_queue_that_does_not_move_takes_a_few_frames_and_refuses_the_rest() {
     alone(async {
         let serial = SerialCan::new("slcan1").await;
-        let mut bus = open(&Interface::SocketCan("slcan1".into()), Clock::start()).unwrap();
+        let mut bus = Bus::open("slcan1", Clock::start());
         assert_eq!(next_link(&mut bus).await, Link::ErrorActive);
         serial.reading.send_replace(false);
         let (mut taken, mut refused) = (0, 0);

@@ -37,15 +37,10 @@ use super::shipped::{SHIPPED, shipped};
 use super::suggest::closest;
 use super::table::{BusDef, DeviceDef, NodeDef, PublishDef, TagTable};
 use super::{At, Diagnostic, SourceText};
-use crate::can::BusIndex;
+use crate::can::{BIT_RATES, BusIndex, DEFAULT_BIT_RATE};
 use crate::canopen::NodeId;
 use crate::process_image::{NodeIndex, TagIndex};
 
-/// Bit rates of CANopen in bit/s (R-DET-089).
-pub const BIT_RATES: [u32; 9] =
-    [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
-/// Bit rate of a bus that says none (R-DET-089).
-pub const DEFAULT_BIT_RATE: u32 = 125_000;
 /// Version of the mapping format that this program reads.
 pub const FORMAT: u64 = 1;
 
