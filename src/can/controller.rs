@@ -118,6 +118,11 @@ impl LinkTracker {
         }
     }
 
+    /// The host says nothing of the interface: that it could be opened has to do.
+    pub fn handle_no_answer(&mut self) -> Option<Link> {
+        if self.link == Link::Absent { self.change(Link::ErrorActive) } else { None }
+    }
+
     /// The socket reported that the interface went down.
     pub fn handle_down(&mut self) -> Option<Link> {
         self.told = self.told.wrapping_add(1);
@@ -249,6 +254,17 @@ mod tests {
     #[test]
     fn the_first_frame_proves_that_the_link_is_up() {
         assert_eq!(LinkTracker::default().handle_frame(), Some(Link::ErrorActive));
+    }
+
+    #[test]
+    fn where_the_host_says_nothing_a_new_bus_works_and_nothing_else_changes() {
+        assert_eq!(LinkTracker::default().handle_no_answer(), Some(Link::ErrorActive));
+        let mut tracker = up();
+        tracker.handle_error(report(0x040, [0; 8]));
+        assert_eq!(tracker.handle_no_answer(), None);
+        assert_eq!(tracker.link(), Link::BusOff);
+        tracker.handle_down();
+        assert_eq!(tracker.handle_no_answer(), None);
     }
 
     proptest! {

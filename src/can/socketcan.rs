@@ -22,7 +22,7 @@ use tokio::io::unix::AsyncFd;
 use tokio::sync::Notify;
 
 use super::controller::LinkTracker;
-use super::host_link::{HostLink, HostWatch, index_of};
+use super::host_link::{HostLink, HostWatch, index_of, is_absence};
 use super::raw_frame::{self, FD_SIZE, Received};
 use super::stamp::Stamper;
 use super::{BusError, BusEvent, BusReader, BusWriter, CanFrame, Link, Tally};
@@ -57,8 +57,15 @@ struct Shared {
 /// # Errors
 /// There is no such interface, it is no CAN interface, or the kernel has no CAN.
 pub fn open(name: &str, clock: Clock) -> Result<(SocketReader, SocketWriter), BusError> {
-    let index = index_of(name).map_err(|source| BusError::Absent { interface: name.to_owned(), source })?;
-    let socket = open_socket(index).map_err(|source| BusError::Io { interface: name.to_owned(), source })?;
+    let index = index_of(name).map_err(|source| {
+        let interface = name.to_owned();
+        if is_absence(&source) {
+            BusError::Absent { interface, source }
+        } else {
+            BusError::Io { interface, source }
+        }
+    })?;
+    let socket = open_socket(index).map_err(|source| io_error(name, source))?;
     let shared = Arc::new(Shared { name: name.to_owned(), socket, look: Notify::new() });
     let reader = SocketReader {
         shared: Arc::clone(&shared),
@@ -66,13 +73,7 @@ pub fn open(name: &str, clock: Clock) -> Result<(SocketReader, SocketWriter), Bu
         clock,
         watch: HostWatch::new(name),
         buffers: Box::new([[0; FD_SIZE]; BATCH]),
-        intake: Intake {
-            ready: VecDeque::with_capacity(2 * BATCH),
-            stamper: Stamper::new(clock.now()),
-            tracker: LinkTracker::default(),
-            tally: Tally::default(),
-            dropped: 0,
-        },
+        intake: Intake::new(clock.now()),
     };
     Ok((reader, SocketWriter { shared, stuck: false }))
 }
@@ -124,6 +125,9 @@ struct Intake {
     stamper: Stamper,
     tracker: LinkTracker,
     tally: Tally,
+    /// A frame came although the interface is said to be down. It may have waited, or the interface is up again and the
+    /// host was not asked since.
+    is_down_in_doubt: bool,
     /// The kernel's count of dropped frames when it was last told; it wraps.
     dropped: u32,
 }
@@ -140,8 +144,8 @@ impl BusReader for SocketReader {
                     let now = self.clock.now();
                     let fd = self.shared.socket.get_ref().as_raw_fd();
                     let received = receive(fd, &mut self.buffers, now, &mut self.intake);
-                    if received != Ok(BATCH) {
-                        // Short of a full batch the queue was empty; what came since has set readiness anew.
+                    if emptied(received) {
+                        // What came since has set readiness anew.
                         readable.clear_ready();
                     }
                     drop(readable);
@@ -162,12 +166,14 @@ impl BusReader for SocketReader {
 
 impl SocketReader {
     fn handle_received(&mut self, received: nix::Result<usize>, now: Now) -> Result<(), BusError> {
+        if emptied(received) {
+            self.intake.stamper.handle_empty(now);
+        }
+        if std::mem::take(&mut self.intake.is_down_in_doubt) {
+            self.watch.hurry();
+        }
         match received {
-            Ok(BATCH) | Err(Errno::EINTR) => Ok(()),
-            Ok(_) | Err(Errno::EAGAIN) => {
-                self.intake.stamper.handle_empty(now);
-                Ok(())
-            }
+            Ok(_) | Err(Errno::EAGAIN | Errno::EINTR) => Ok(()),
             Err(Errno::ENETDOWN) => {
                 let change = self.intake.tracker.handle_down();
                 self.intake.push_link(change, now);
@@ -178,19 +184,21 @@ impl SocketReader {
         }
     }
 
-    fn handle_host(&mut self, asked: u64, answer: io::Result<HostLink>) -> Result<(), BusError> {
-        let host = answer.map_err(|source| self.absent(source))?;
-        if host.index != self.index {
-            return Err(self.absent(io::Error::other("it was deleted, and another took its name")));
-        }
-        self.intake.tally.bit_rate = host.bit_rate;
-        // Without details, what the socket tells has to do.
-        let Some(observation) = host.observation else {
-            let change = self.intake.tracker.handle_frame();
+    fn handle_host(&mut self, asked: u64, answer: io::Result<Option<HostLink>>) -> Result<(), BusError> {
+        let Some(host) = answer.map_err(|source| self.absent(source))? else {
+            let change = self.intake.tracker.handle_no_answer();
             self.intake.push_link(change, self.clock.now());
             return Ok(());
         };
-        let change = self.intake.tracker.handle_observation(asked, observation);
+        if host.index != self.index {
+            return Err(self.absent(io::Error::other("it was deleted, and another took its name")));
+        }
+        self.intake.tally.bit_rate = host.bit_rate.or(self.intake.tally.bit_rate);
+        let tracker = &mut self.intake.tracker;
+        let change = match host.observation {
+            Some(observation) => tracker.handle_observation(asked, observation),
+            None => tracker.handle_no_answer(),
+        };
         self.intake.push_link(change, self.clock.now());
         Ok(())
     }
@@ -201,10 +209,22 @@ impl SocketReader {
 }
 
 impl Intake {
+    fn new(now: Now) -> Self {
+        Self {
+            ready: VecDeque::with_capacity(2 * BATCH),
+            stamper: Stamper::new(now),
+            tracker: LinkTracker::default(),
+            tally: Tally::default(),
+            is_down_in_doubt: false,
+            dropped: 0,
+        }
+    }
+
     fn handle_message(&mut self, now: Now, bytes: &[u8], received: Option<Timestamp>) {
         match raw_frame::decode(bytes) {
             Received::Frame(frame) => {
                 let at = self.stamper.stamp(now, received);
+                self.is_down_in_doubt |= self.tracker.link() == Link::Down;
                 let change = self.tracker.handle_frame();
                 self.push_link(change, at);
                 self.ready.push_back(BusEvent::Frame { frame, at });
@@ -259,6 +279,14 @@ fn receive(
         intake.handle_message(now, message.iovs().next().unwrap_or_default(), received);
     }
     Ok(count)
+}
+
+/// Whether a reading left nothing in the socket. An error of the interface says nothing about the frames that wait behind it.
+fn emptied(received: nix::Result<usize>) -> bool {
+    match received {
+        Ok(count) => count < BATCH,
+        Err(error) => error == Errno::EAGAIN,
+    }
 }
 
 fn timestamp(time: TimeSpec) -> Timestamp {
@@ -317,5 +345,29 @@ impl SocketWriter {
         } else {
             BusError::Io { interface, source }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_that_wait_behind_an_error_are_read_without_waiting_for_another() {
+        assert!(emptied(Ok(0)) && emptied(Ok(BATCH - 1)) && emptied(Err(Errno::EAGAIN)));
+        assert!(!emptied(Ok(BATCH)) && !emptied(Err(Errno::ENETDOWN)) && !emptied(Err(Errno::EINTR)));
+    }
+
+    #[test]
+    fn a_frame_on_an_interface_that_is_said_to_be_down_casts_doubt_on_it() {
+        let now = Now::from_millis(0);
+        let mut intake = Intake::new(now);
+        let message = raw_frame::encode(&"181#01".parse().unwrap());
+        intake.handle_message(now, &message, None);
+        assert!(!intake.is_down_in_doubt);
+        intake.tracker.handle_down();
+        intake.handle_message(now, &message, None);
+        assert!(intake.is_down_in_doubt);
+        assert_eq!(intake.tracker.link(), Link::Down, "it may have waited since before");
     }
 }
