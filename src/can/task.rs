@@ -14,12 +14,15 @@ use tokio::time::{Interval, MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
 use super::interface::Interface;
-use super::outage::{Outage, Repeats};
+use super::outage::{Outage, OutageMessage, Repeats};
 use super::{BusCounters, BusError, BusEvent, BusIndex, BusReader, BusWriter, CanFrame, Link, Tally, open};
 use crate::time::{Clock, Instant};
 
 /// Time between a failure and the first try to open the bus again; it doubles up to the longest.
 const FIRST_WAIT: Duration = Duration::from_millis(100);
+
+/// A bus that worked for so long was no false start: its failure is a first one.
+const STEADY: Duration = Duration::from_secs(10);
 
 /// How often the counters are reported.
 const REPORT_EVERY: Duration = Duration::from_secs(1);
@@ -100,6 +103,17 @@ struct State {
     counters: BusCounters,
     /// What readers of earlier openings had counted.
     before: Tally,
+    /// Frames that were counted as sent and came back, and their bits: counters never go back, so that the next ones are
+    /// not counted instead.
+    frames_too_many: u64,
+    bits_too_many: u64,
+}
+
+/// Adds to a counter, less what it has too many.
+fn add(counter: &mut u64, amount: u64, too_many: &mut u64) {
+    let known = amount.min(*too_many);
+    *too_many -= known;
+    *counter = counter.saturating_add(amount - known);
 }
 
 impl Desk {
@@ -125,6 +139,31 @@ impl Desk {
             state.counters.bus_off_count = state.counters.bus_off_count.saturating_add(1);
         }
         changed
+    }
+
+    fn count_received(&self, frame: &CanFrame) {
+        let State { counters, bits_too_many, .. } = &mut *self.state();
+        counters.frames_received = counters.frames_received.saturating_add(1);
+        add(&mut counters.wire_bits, u64::from(frame.wire_bits()), bits_too_many);
+    }
+
+    fn count_sent(&self, frame: &CanFrame) {
+        let State { counters, frames_too_many, bits_too_many, .. } = &mut *self.state();
+        add(&mut counters.frames_sent, 1, frames_too_many);
+        add(&mut counters.wire_bits, u64::from(frame.wire_bits()), bits_too_many);
+    }
+
+    fn count_not_sent(&self) {
+        let counters = &mut self.state().counters;
+        counters.frames_not_sent = counters.frames_not_sent.saturating_add(1);
+    }
+
+    /// A frame that the interface had taken, so that it is counted as sent, did not leave.
+    fn count_came_back(&self, frame: &CanFrame) {
+        self.count_not_sent();
+        let mut state = self.state();
+        state.frames_too_many = state.frames_too_many.saturating_add(1);
+        state.bits_too_many = state.bits_too_many.saturating_add(u64::from(frame.wire_bits()));
     }
 
     fn is_up(&self) -> bool {
@@ -171,9 +210,10 @@ async fn read_for_ever<R: BusReader, W: BusWriter>(
         let error = match open() {
             Ok((mut reader, opened)) => {
                 *writer.lock().await = Some(opened);
-                let mut session = Session { desk, log: &mut log, was_up: false };
+                let mut session = Session { desk, log: &mut log, up_since: None };
                 let error = session.read(&mut reader, &mut reports).await?;
-                if session.was_up {
+                let now = desk.clock.now().instant;
+                if session.up_since.is_some_and(|since| now.since(since) >= STEADY) {
                     wait = FIRST_WAIT;
                 }
                 *writer.lock().await = None;
@@ -182,17 +222,19 @@ async fn read_for_ever<R: BusReader, W: BusWriter>(
             }
             Err(error) => error,
         };
-        log.outage.handle_error(&desk.name, &error, desk.clock.now().instant);
-        let link = if matches!(error, BusError::Down { .. }) { Link::Down } else { Link::Absent };
-        if desk.set_link(link) {
-            desk.tell(BusEvent::Link { link, at: desk.clock.now() }).await?;
+        log.handle_error(&desk.name, &error, desk.clock.now().instant);
+        if desk.set_link(Link::Absent) {
+            desk.tell(BusEvent::Link { link: Link::Absent, at: desk.clock.now() }).await?;
         }
         let again = tokio::time::sleep(wait);
         tokio::pin!(again);
         loop {
             tokio::select! {
                 () = &mut again => break,
-                _ = reports.tick() => desk.tell_counters().await?,
+                _ = reports.tick() => {
+                    log.handle_timeout(&desk.name, desk.clock.now().instant);
+                    desk.tell_counters().await?;
+                }
             }
         }
         wait = longest_wait.min(wait * 2);
@@ -203,8 +245,6 @@ async fn read_for_ever<R: BusReader, W: BusWriter>(
 #[derive(Default)]
 struct Log {
     outage: Outage,
-    down: Repeats,
-    bus_off: Repeats,
     passive: Repeats,
     suspected_bit_rate: bool,
 }
@@ -213,7 +253,8 @@ struct Log {
 struct Session<'a> {
     desk: &'a Desk,
     log: &'a mut Log,
-    was_up: bool,
+    /// Since when the bus has worked, of this opening.
+    up_since: Option<Instant>,
 }
 
 impl Session<'_> {
@@ -232,6 +273,9 @@ impl Session<'_> {
                 }
             };
             let lost_frames = self.desk.take_tally(reader.tally());
+            if event.is_none() {
+                self.log.handle_timeout(&self.desk.name, self.desk.clock.now().instant);
+            }
             if lost_frames || event.is_none() {
                 self.suspect_bit_rate();
                 self.desk.tell_counters().await?;
@@ -244,23 +288,18 @@ impl Session<'_> {
 
     async fn handle(&mut self, event: BusEvent) -> Result<(), GatewayGone> {
         match event {
-            BusEvent::Frame { frame, .. } => {
-                let counters = &mut self.desk.state().counters;
-                counters.frames_received = counters.frames_received.saturating_add(1);
-                counters.wire_bits = counters.wire_bits.saturating_add(u64::from(frame.wire_bits()));
-            }
+            BusEvent::Frame { frame, .. } => self.desk.count_received(&frame),
             BusEvent::Link { link, at } => {
                 if !self.desk.set_link(link) {
                     return Ok(());
                 }
-                self.was_up |= link.is_up();
+                if link.is_up() {
+                    self.up_since.get_or_insert(at.instant);
+                }
                 self.log.handle_link(&self.desk.name, link, at.instant);
                 self.suspect_bit_rate();
             }
-            BusEvent::NotSent { .. } => {
-                let counters = &mut self.desk.state().counters;
-                counters.frames_not_sent = counters.frames_not_sent.saturating_add(1);
-            }
+            BusEvent::NotSent { frame, .. } => self.desk.count_came_back(&frame),
             // Counters are this task's own business.
             BusEvent::Counters { .. } => return Ok(()),
         }
@@ -286,36 +325,53 @@ impl Session<'_> {
 
 impl Log {
     fn handle_link(&mut self, interface: &str, link: Link, at: Instant) {
-        if link.is_up() {
-            self.outage.handle_up(interface, at);
+        let message = match trouble(interface, link) {
+            Some(reason) => self.outage.handle_down(&reason, at),
+            None => self.outage.handle_up(at),
+        };
+        write(interface, message);
+        if link == Link::ErrorActive {
+            tracing::debug!(interface, "error active");
         }
-        match link {
-            Link::ErrorActive => tracing::debug!(interface, "the bus works"),
-            Link::ErrorPassive => {
-                if let Some(unsaid) = self.passive.admit(at) {
-                    tracing::warn!(
-                        interface,
-                        unsaid,
-                        "error passive: nobody acknowledges, or wiring or bit rate are wrong"
-                    );
-                }
-            }
-            Link::BusOff => {
-                if let Some(unsaid) = self.bus_off.admit(at) {
-                    tracing::warn!(
-                        interface,
-                        unsaid,
-                        "bus-off: the controller has left the bus; it comes back by itself where the interface has \
-                         a restart-ms, else with `ip link set {interface} type can restart`"
-                    );
-                }
-            }
-            Link::Down | Link::Absent => {
-                if let Some(unsaid) = self.down.admit(at) {
-                    tracing::warn!(interface, unsaid, "the interface is down");
-                }
-            }
+        if link == Link::ErrorPassive
+            && let Some(unsaid) = self.passive.admit(at)
+        {
+            let text = "error passive: nobody acknowledges, or wiring or bit rate are wrong";
+            tracing::warn!(interface, unsaid, "{text}");
         }
+    }
+
+    fn handle_error(&mut self, interface: &str, error: &BusError, now: Instant) {
+        let reason = format!("{error}; trying again until it works");
+        write(interface, self.outage.handle_down(&reason, now));
+    }
+
+    fn handle_timeout(&mut self, interface: &str, now: Instant) {
+        write(interface, self.outage.handle_timeout(now));
+    }
+}
+
+/// Why a bus in this state cannot be used, if so.
+fn trouble(interface: &str, link: Link) -> Option<String> {
+    match link {
+        Link::ErrorActive | Link::ErrorPassive => None,
+        Link::BusOff => Some(format!(
+            "bus-off: the controller has left the bus; it comes back by itself where the interface has a restart-ms, \
+             else with `ip link set {interface} type can restart`"
+        )),
+        Link::Down | Link::Absent => {
+            Some(format!("the interface is down; bring it up with `ip link set {interface} up`"))
+        }
+    }
+}
+
+fn write(interface: &str, message: Option<OutageMessage>) {
+    match message {
+        Some(OutageMessage::Begun { reason, unsaid }) => tracing::warn!(interface, unsaid, "{reason}"),
+        Some(OutageMessage::Over { lasted }) => {
+            tracing::info!(interface, seconds = lasted.as_secs(), "the bus works again");
+        }
+        None => {}
     }
 }
 
@@ -327,33 +383,27 @@ async fn write_for_ever<W: BusWriter>(
 ) -> Result<(), GatewayGone> {
     let mut failures = Repeats::default();
     while let Some(frame) = transmit.recv().await {
-        let error = match writer.lock().await.as_mut() {
-            Some(writer) if desk.is_up() => writer.send(&frame).await.err(),
-            Some(_) | None => {
-                not_sent(desk, frame).await?;
+        // The lock ends here: the gateway may be slow to take what it is told.
+        let sent = match writer.lock().await.as_mut() {
+            Some(writer) if desk.is_up() => Some(writer.send(&frame).await),
+            Some(_) | None => None,
+        };
+        match sent {
+            Some(Ok(())) => {
+                desk.count_sent(&frame);
                 continue;
             }
-        };
-        let Some(error) = error else {
-            let counters = &mut desk.state().counters;
-            counters.frames_sent = counters.frames_sent.saturating_add(1);
-            counters.wire_bits = counters.wire_bits.saturating_add(u64::from(frame.wire_bits()));
-            continue;
-        };
-        if let Some(unsaid) = failures.admit(desk.clock.now().instant) {
-            tracing::warn!(interface = desk.name, %frame, %error, unsaid, "a frame was not sent");
+            Some(Err(error)) => {
+                if let Some(unsaid) = failures.admit(desk.clock.now().instant) {
+                    tracing::warn!(interface = desk.name, %frame, %error, unsaid, "a frame was not sent");
+                }
+            }
+            None => {}
         }
-        not_sent(desk, frame).await?;
+        desk.count_not_sent();
+        desk.tell(BusEvent::NotSent { frame, at: desk.clock.now() }).await?;
     }
     Ok(())
-}
-
-async fn not_sent(desk: &Desk, frame: CanFrame) -> Result<(), GatewayGone> {
-    {
-        let counters = &mut desk.state().counters;
-        counters.frames_not_sent = counters.frames_not_sent.saturating_add(1);
-    }
-    desk.tell(BusEvent::NotSent { frame, at: desk.clock.now() }).await
 }
 
 #[cfg(test)]

@@ -8,6 +8,9 @@ use crate::can::virtual_bus::VirtualBus;
 
 type Told = (BusIndex, BusEvent);
 
+/// The longest wait between two openings.
+const LONGEST: Duration = Duration::from_millis(500);
+
 /// A bus that a test plays.
 struct FakeReader {
     script: mpsc::Receiver<Result<BusEvent, BusError>>,
@@ -78,7 +81,7 @@ fn run_on(openings: Vec<Result<(FakeReader, FakeWriter), BusError>>) -> Harness 
     let open = move || openings.pop_front().unwrap_or_else(|| Err(absent()));
     let ends =
         Ends { bus: BusIndex(3), name: "fake".into(), events, transmit: to_send, clock, stop: stop.clone() };
-    let task = tokio::spawn(run_with(open, Duration::from_millis(500), ends));
+    let task = tokio::spawn(run_with(open, LONGEST, ends));
     Harness { events: told, transmit, stop, clock, task }
 }
 
@@ -248,6 +251,80 @@ async fn counters_are_told_at_once_when_frames_were_lost_and_once_a_second_else(
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_frame_that_the_interface_took_and_gave_back_counts_as_not_sent_and_no_counter_goes_back() {
+    let (mut stage, bus) = fake_bus();
+    let mut harness = run_on(vec![Ok(bus)]);
+    stage.script.send(Ok(link(Link::ErrorActive))).await.unwrap();
+    harness.next_link().await;
+    let refused = frame("701#R1");
+    harness.transmit.send(refused).await.unwrap();
+    stage.sent.recv().await.unwrap();
+    assert_eq!(harness.counters().await.frames_sent, 1);
+    let back = BusEvent::NotSent { frame: refused, at: harness.clock.now() };
+    stage.script.send(Ok(back.clone())).await.unwrap();
+    assert_eq!(harness.next().await, back);
+    let counters = harness.counters().await;
+    assert_eq!((counters.frames_sent, counters.frames_not_sent), (1, 1));
+    for _ in 0..2 {
+        harness.transmit.send(frame("701#R1")).await.unwrap();
+        stage.sent.recv().await.unwrap();
+    }
+    let counters = harness.counters().await;
+    let bits = u64::from(refused.wire_bits());
+    assert_eq!((counters.frames_sent, counters.frames_not_sent, counters.wire_bits), (2, 1, 2 * bits));
+}
+
+/// When a bus is opened that each time works for so long, in milliseconds since the start.
+async fn openings_of_a_bus_that_works_for(each: Duration) -> Vec<u64> {
+    let clock = Clock::start();
+    let opened = Arc::new(Mutex::new(Vec::new()));
+    let times = Arc::clone(&opened);
+    let open = move || {
+        times.lock().unwrap().push(clock.now().instant.as_millis());
+        let (stage, bus) = fake_bus();
+        tokio::spawn(async move {
+            stage.script.send(Ok(BusEvent::Link { link: Link::ErrorActive, at: clock.now() })).await.unwrap();
+            tokio::time::sleep(each).await;
+            let _ = stage.script.send(Err(absent())).await;
+        });
+        Ok(bus)
+    };
+    let (events, mut told) = mpsc::channel(1_024);
+    let (_transmit, to_send) = mpsc::channel(64);
+    let stop = CancellationToken::new();
+    let ends = Ends { bus: BusIndex(0), name: "fake".into(), events, transmit: to_send, clock, stop };
+    let _task = tokio_util::task::AbortOnDropHandle::new(tokio::spawn(run_with(open, LONGEST, ends)));
+    while opened.lock().unwrap().len() < 6 {
+        told.recv().await.unwrap();
+    }
+    opened.lock().unwrap().clone()
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_bus_that_works_only_for_moments_is_opened_ever_more_seldom() {
+    let opened = openings_of_a_bus_that_works_for(Duration::from_millis(10)).await;
+    assert_eq!(opened, [0, 110, 320, 730, 1_240, 1_750]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_bus_that_has_worked_for_ten_seconds_is_opened_again_at_once() {
+    let opened = openings_of_a_bus_that_works_for(STEADY).await;
+    assert_eq!(opened, [0, 10_100, 20_200, 30_300, 40_400, 50_500]);
+}
+
+#[test]
+fn a_bus_that_is_down_or_off_is_in_trouble_and_its_end_is_told() {
+    for link in [Link::Absent, Link::Down, Link::BusOff] {
+        let mut log = Log::default();
+        log.handle_link("can0", link, Instant::START);
+        assert!(log.outage.handle_up(Instant::START).is_some(), "{link:?}");
+    }
+    for link in [Link::ErrorActive, Link::ErrorPassive] {
+        assert_eq!(trouble("can0", link), None);
+    }
+}
+
+#[tokio::test(start_paused = true)]
 async fn reading_goes_on_while_a_send_hangs() {
     struct Hanging;
     impl BusWriter for Hanging {
@@ -263,7 +340,7 @@ async fn reading_goes_on_while_a_send_hangs() {
     let open = move || opening.take().ok_or_else(absent);
     let name = "fake".to_owned();
     let ends = Ends { bus: BusIndex(0), name, events, transmit: to_send, clock: Clock::start(), stop };
-    let _task = tokio::spawn(run_with(open, Duration::from_millis(500), ends));
+    let _task = tokio::spawn(run_with(open, LONGEST, ends));
     stage.script.send(Ok(link(Link::ErrorActive))).await.unwrap();
     transmit.send(frame("701#R1")).await.unwrap();
     for _ in 0..100 {
@@ -299,7 +376,7 @@ async fn a_virtual_bus_is_run_by_the_same_task() {
     let ours = bus.clone();
     let name = "virtual:test".to_owned();
     let ends = Ends { bus: BusIndex(0), name, events, transmit: to_send, clock, stop };
-    let _task = tokio::spawn(run_with(move || Ok(ours.join(clock)), Duration::from_millis(500), ends));
+    let _task = tokio::spawn(run_with(move || Ok(ours.join(clock)), LONGEST, ends));
     let (mut reader, mut writer) = bus.join(clock);
     while !matches!(told.recv().await.unwrap().1, BusEvent::Link { link: Link::ErrorActive, .. }) {}
     transmit.send(frame("000#0101")).await.unwrap();
