@@ -2,6 +2,7 @@
 
 use super::interface::Interface;
 use super::slcan_port::{self, SlcanReader, SlcanWriter};
+use super::slcan_session::Adapter;
 use super::socketcan::{self, SocketReader, SocketWriter};
 use super::virtual_bus::{self, VirtualReader, VirtualWriter};
 use super::{BusError, BusEvent, BusReader, BusWriter, CanFrame, Tally};
@@ -45,8 +46,14 @@ pub fn open(interface: &Interface, clock: Clock) -> Result<(AnyReader, AnyWriter
             let (reader, writer) = virtual_bus::join(name, clock);
             (AnyReader::Virtual(reader), AnyWriter::Virtual(writer))
         }
-        Interface::Slcan { .. } | Interface::SlcanTcp { .. } => {
-            let (reader, writer) = slcan_port::open(interface, clock);
+        Interface::Slcan { device, bit_rate, baud } => {
+            let adapter = Adapter { name: interface.to_string(), bit_rate: Some(*bit_rate) };
+            let (reader, writer) = slcan_port::open_serial(adapter, device.clone(), *baud, clock);
+            (AnyReader::Slcan(reader), AnyWriter::Slcan(writer))
+        }
+        Interface::SlcanTcp { host, port, bit_rate } => {
+            let adapter = Adapter { name: interface.to_string(), bit_rate: *bit_rate };
+            let (reader, writer) = slcan_port::open_tcp(adapter, host.clone(), *port, clock);
             (AnyReader::Slcan(reader), AnyWriter::Slcan(writer))
         }
     })

@@ -8,7 +8,8 @@
 //! - [`bus`] \[IO\]: [`open`] any interface.
 //! - [`socketcan`] \[IO\]: interfaces of the host, with [`host_link`] \[IO\] (what the host says of them) and, pure,
 //!   [`raw_frame`] (what a socket gives), [`controller`] (the state of the link), [`stamp`] (receive times).
-//! - [`slcan_port`] \[IO\]: LAWICEL adapters on serial ports and TCP; [`slcan`], pure, is their language.
+//! - [`slcan_port`] \[IO\]: LAWICEL adapters on serial ports and TCP, with [`slcan_session`] \[IO\] (the conversation)
+//!   and, pure, [`slcan`] (their language) and [`slcan_answers`] (what is known of one of them).
 //! - [`virtual_bus`] \[IO\]: buses inside the process.
 //! - [`task`] \[IO\]: owns one bus, opens it again whenever it was lost, counts; [`outage`] keeps its log short.
 //! - [`recording`]: candump logs, pure.
@@ -22,7 +23,9 @@ pub mod outage;
 pub mod raw_frame;
 pub mod recording;
 pub mod slcan;
+pub mod slcan_answers;
 pub mod slcan_port;
+pub mod slcan_session;
 pub mod socketcan;
 pub mod stamp;
 pub mod task;
