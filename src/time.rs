@@ -130,7 +130,7 @@ impl Now {
 
 /// The clock of an IO task. Copies tell the same time.
 ///
-/// Built on tokio's clock, so that a test with `start_paused` governs it.
+/// [`Now::instant`] is tokio's clock, so that a test with `start_paused` governs it; [`Now::utc`] is always that of the host.
 #[derive(Clone, Copy, Debug)]
 pub struct Clock {
     origin: tokio::time::Instant,
