@@ -32,11 +32,19 @@ pub enum AnyWriter {
 
 /// Opens an interface. Must be called inside a tokio runtime.
 ///
+/// `listen_only` demands that nothing leaves, not even the acknowledging of frames: an adapter that cannot do so fails. An
+/// interface of the host is as the host has set it up; [`Tally::listens_only`] says how.
+///
 /// Opening does not wait: a bus that takes time to be usable says so by its first event, its [`Link`](super::Link).
 ///
 /// # Errors
 /// The interface is not there, or the system refuses it.
-pub fn open(interface: &Interface, clock: Clock) -> Result<(AnyReader, AnyWriter), BusError> {
+pub fn open(
+    interface: &Interface,
+    listen_only: bool,
+    clock: Clock,
+) -> Result<(AnyReader, AnyWriter), BusError> {
+    let adapter = |bit_rate| Adapter { name: interface.to_string(), bit_rate, listen_only };
     Ok(match interface {
         Interface::SocketCan(name) => {
             let (reader, writer) = socketcan::open(name, clock)?;
@@ -47,12 +55,12 @@ pub fn open(interface: &Interface, clock: Clock) -> Result<(AnyReader, AnyWriter
             (AnyReader::Virtual(reader), AnyWriter::Virtual(writer))
         }
         Interface::Slcan { device, bit_rate, baud } => {
-            let adapter = Adapter { name: interface.to_string(), bit_rate: Some(*bit_rate) };
+            let adapter = adapter(Some(*bit_rate));
             let (reader, writer) = slcan_port::open_serial(adapter, device.clone(), *baud, clock);
             (AnyReader::Slcan(reader), AnyWriter::Slcan(writer))
         }
         Interface::SlcanTcp { host, port, bit_rate } => {
-            let adapter = Adapter { name: interface.to_string(), bit_rate: *bit_rate };
+            let adapter = adapter(*bit_rate);
             let (reader, writer) = slcan_port::open_tcp(adapter, host.clone(), *port, clock);
             (AnyReader::Slcan(reader), AnyWriter::Slcan(writer))
         }

@@ -6,8 +6,8 @@
 use std::io;
 use std::time::Duration;
 
-use ::socketcan::CanInterface;
 use ::socketcan::nl::{CanState, InterfaceDetails};
+use ::socketcan::{CanCtrlMode, CanInterface};
 use nix::errno::Errno;
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior, interval};
@@ -30,6 +30,8 @@ pub struct HostLink {
     pub observation: Option<Observation>,
     /// Bit rate in bit/s, where there is one.
     pub bit_rate: Option<u32>,
+    /// The controller does not even acknowledge frames; `None` where there is no controller.
+    pub listens_only: Option<bool>,
 }
 
 /// The number of a network interface.
@@ -77,7 +79,7 @@ fn answer<E: std::fmt::Display>(
             tracing::debug!(%error, "the host gives no details of the interface");
             let up = flags().as_deref().and_then(is_up);
             let observation = up.map(|up| Observation { up, controller: None });
-            HostLink { index, observation, bit_rate: None }
+            HostLink { index, observation, bit_rate: None, listens_only: None }
         }
     }))
 }
@@ -96,7 +98,9 @@ fn describe(index: u32, details: &InterfaceDetails) -> HostLink {
         Some(CanState::Stopped | CanState::Sleeping) | None => None,
     };
     let bit_rate = details.can.bit_timing.map(|timing| timing.bitrate).filter(|rate| *rate > 0);
-    HostLink { index, observation: Some(Observation { up: details.is_up, controller }), bit_rate }
+    let listens_only = details.can.ctrl_mode.map(|modes| modes.has_mode(CanCtrlMode::ListenOnly));
+    let observation = Some(Observation { up: details.is_up, controller });
+    HostLink { index, observation, bit_rate, listens_only }
 }
 
 /// Asks the host about one interface from time to time.
@@ -149,6 +153,8 @@ impl HostWatch {
 
 #[cfg(test)]
 mod tests {
+    use ::socketcan::nl::CanCtrlModes;
+
     use super::*;
 
     fn without_netlink(index: Result<u32, Errno>, flags: Option<&str>) -> io::Result<Option<HostLink>> {
@@ -181,10 +187,13 @@ mod tests {
     fn netlink_knows_the_controller_and_the_bit_rate() {
         let mut details = InterfaceDetails { is_up: true, ..InterfaceDetails::default() };
         details.can.state = Some(CanState::BusOff);
+        details.can.ctrl_mode = Some(CanCtrlModes::from_mode(CanCtrlMode::ListenOnly, true));
         let no_flags = || panic!("the flags are not needed");
         let host = answer(Ok(7), |_| Ok::<_, io::Error>(details), no_flags).unwrap().unwrap();
         let observation = Observation { up: true, controller: Some(Link::BusOff) };
-        assert_eq!(host, HostLink { index: 7, observation: Some(observation), bit_rate: None });
+        let expected =
+            HostLink { index: 7, observation: Some(observation), bit_rate: None, listens_only: Some(true) };
+        assert_eq!(host, expected);
     }
 
     #[tokio::test(start_paused = true)]

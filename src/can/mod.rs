@@ -145,6 +145,9 @@ pub struct Tally {
     pub overruns: u64,
     /// As [`BusCounters::bit_rate`].
     pub bit_rate: Option<u32>,
+    /// Whether the controller only listens and does not even acknowledge frames; `None` where there is no controller or
+    /// nothing is known of it.
+    pub listens_only: Option<bool>,
 }
 
 /// The receiving half of a bus: receiving never waits for sending. The bus is closed when both halves are dropped.

@@ -98,12 +98,12 @@ mod tests {
         Instant::from_millis(millis)
     }
 
-    fn begun(reason: &str, unsaid: u64) -> Option<OutageMessage> {
-        Some(OutageMessage::Begun { reason: reason.to_owned(), unsaid })
+    fn begun(reason: &str, unsaid: u64) -> OutageMessage {
+        OutageMessage::Begun { reason: reason.to_owned(), unsaid }
     }
 
-    fn over(millis: u64) -> Option<OutageMessage> {
-        Some(OutageMessage::Over { lasted: Duration::from_millis(millis) })
+    fn over(millis: u64) -> OutageMessage {
+        OutageMessage::Over { lasted: Duration::from_millis(millis) }
     }
 
     #[test]
@@ -120,11 +120,11 @@ mod tests {
     fn an_outage_is_told_once_with_its_reason_and_once_with_its_length() {
         let mut outage = Outage::default();
         assert_eq!(outage.handle_up(at(0)), None, "it had never failed");
-        assert_eq!(outage.handle_down("gone", at(1_000)), begun("gone", 0));
+        assert_eq!(outage.handle_down("gone", at(1_000)), Some(begun("gone", 0)));
         for again in 2..200 {
             assert_eq!(outage.handle_down("gone", at(again * 1_000)), None);
         }
-        assert_eq!(outage.handle_up(at(200_000)), over(199_000));
+        assert_eq!(outage.handle_up(at(200_000)), Some(over(199_000)));
         assert_eq!(outage.handle_up(at(200_001)), None);
     }
 
@@ -134,22 +134,22 @@ mod tests {
         outage.handle_down("gone", at(0));
         assert_eq!(outage.handle_down("refused", at(1_000)), None);
         assert_eq!(outage.handle_timeout(at(9_999)), None);
-        assert_eq!(outage.handle_timeout(at(10_000)), begun("refused", 0));
-        assert_eq!(outage.handle_up(at(12_000)), over(12_000), "since the first reason");
+        assert_eq!(outage.handle_timeout(at(10_000)), Some(begun("refused", 0)));
+        assert_eq!(outage.handle_up(at(12_000)), Some(over(12_000)), "since the first reason");
     }
 
     #[test]
     fn a_bus_that_flaps_fills_no_log_and_the_last_word_is_true() {
         let mut outage = Outage::default();
-        assert_eq!(outage.handle_down("gone", at(0)), begun("gone", 0));
-        assert_eq!(outage.handle_up(at(100)), over(100));
+        assert_eq!(outage.handle_down("gone", at(0)), Some(begun("gone", 0)));
+        assert_eq!(outage.handle_up(at(100)), Some(over(100)));
         for flap in 1..90 {
             assert_eq!(outage.handle_down("gone", at(flap * 100)), None);
             assert_eq!(outage.handle_up(at(flap * 100 + 50)), None);
         }
         // The log says that it works. It does not, and that is told in time.
         assert_eq!(outage.handle_down("gone", at(9_500)), None);
-        assert_eq!(outage.handle_timeout(at(10_000)), begun("gone", 89));
-        assert_eq!(outage.handle_up(at(10_100)), over(600));
+        assert_eq!(outage.handle_timeout(at(10_000)), Some(begun("gone", 89)));
+        assert_eq!(outage.handle_up(at(10_100)), Some(over(600)));
     }
 }

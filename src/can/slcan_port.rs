@@ -1,6 +1,6 @@
 //! A LAWICEL adapter on a serial port or behind TCP. \[IO\]
 //!
-//! A task of its own opens the port, sets the adapter up (`C`, `S`, `O`) and then reads and writes side by side. When
+//! A task of its own opens the port, sets the adapter up (`C`, `S`, `O` or `L`) and then reads and writes side by side. When
 //! anything fails, the bus ends with an error and is to be opened again. Once a second the adapter is asked for its
 //! status flags (`F`): they tell an error-passive controller, an adapter that answered before and does so no more is
 //! given up, and one that refuses has closed its channel. Adapters that always refuse the question or never answer at all

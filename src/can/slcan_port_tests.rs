@@ -1,7 +1,7 @@
 //! Tests of LAWICEL adapters: the test is the adapter, in memory, behind TCP or on a pseudo-terminal.
 
 use nix::sys::socket::getsockopt;
-use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, DuplexStream};
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader, DuplexStream};
 
 use super::*;
 use crate::can::Link;
@@ -58,7 +58,7 @@ impl<P: AsyncRead + AsyncWrite + Unpin> Played<P> {
 }
 
 fn adapter(bit_rate: Option<u32>) -> Adapter {
-    Adapter { name: "slcan:test".to_owned(), bit_rate }
+    Adapter { name: "slcan:test".to_owned(), bit_rate, listen_only: false }
 }
 
 /// The task's side, on a port in memory.
@@ -99,6 +99,34 @@ async fn r_det_089_the_adapter_is_closed_set_to_its_bit_rate_and_opened() {
     played.set_up(Some("S4")).await;
     assert_eq!(next_link(&mut reader).await, Link::ErrorActive);
     assert_eq!(reader.tally().bit_rate, Some(125_000));
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_passive_role_opens_an_adapter_to_listen_only_or_not_at_all() {
+    let passive = || {
+        let (near, far) = tokio::io::duplex(1_024);
+        let adapter = Adapter { listen_only: true, ..adapter(Some(125_000)) };
+        let (reader, writer) = start(adapter, Clock::start(), async { Ok(near) });
+        (Played::new(far), reader, writer)
+    };
+    for (answer, opens) in [("\r", true), ("\x07", false)] {
+        let (mut played, mut reader, _writer) = passive();
+        assert_eq!(played.command().await, "C");
+        played.say("\r").await;
+        assert_eq!(played.command().await, "S4");
+        played.say("\r").await;
+        assert_eq!(played.command().await, "L");
+        played.say(answer).await;
+        if opens {
+            assert_eq!(next_link(&mut reader).await, Link::ErrorActive);
+            continue;
+        }
+        let error = reader.recv().await.unwrap_err().to_string();
+        assert!(error.contains("refuses to listen only"), "{error}");
+        let mut rest = Vec::new();
+        played.port.read_to_end(&mut rest).await.unwrap();
+        assert_eq!(rest, b"", "it hangs up and does not try `O`");
+    }
 }
 
 #[tokio::test(start_paused = true)]

@@ -1,4 +1,4 @@
-//! The conversation with a LAWICEL adapter: setting it up (`C`, `S`, `O`), then reading and writing side by side. \[IO\]
+//! The conversation with a LAWICEL adapter: setting it up (`C`, `S`, `O` or `L`), then reading and writing side by side. \[IO\]
 
 use std::convert::Infallible;
 use std::io;
@@ -30,6 +30,8 @@ pub struct Adapter {
     pub name: String,
     /// Bit rate of the CAN bus in bit/s, one of [`BIT_RATES`](super::BIT_RATES); `None` leaves what the adapter has.
     pub bit_rate: Option<u32>,
+    /// Open the channel to listen only (`L`): nothing is sent, not even the acknowledging of frames.
+    pub listen_only: bool,
 }
 
 /// What the halves of the bus and its task share.
@@ -180,7 +182,7 @@ async fn set_up<P: AsyncRead + AsyncWrite + Unpin>(
             .ok_or_else(|| Failure::other(format!("no LAWICEL adapter has the bit rate {bit_rate}")))?;
         ask(port, &mut opening, &command).await?;
     }
-    ask(port, &mut opening, "O").await?;
+    ask(port, &mut opening, if adapter.listen_only { "L" } else { "O" }).await?;
     Ok(opening)
 }
 
@@ -227,7 +229,7 @@ async fn ask<P: AsyncRead + AsyncWrite + Unpin>(
                 Some(Incoming::Done) => return Ok(None),
                 Some(Incoming::Frame(frame)) => return Ok(Some(frame)),
                 Some(Incoming::Refused) => {
-                    return Err(Failure::other(format!("the adapter refuses the command `{command}`")));
+                    return Err(Failure::other(refusal(command)));
                 }
                 Some(
                     Incoming::Fd
@@ -241,14 +243,23 @@ async fn ask<P: AsyncRead + AsyncWrite + Unpin>(
             }
         }
     };
-    match timeout(ANSWER_TIME, answer).await {
-        Ok(first) => {
-            opening.first = first?;
-            opening.answered = true;
-        }
-        Err(_) => tracing::debug!(command, "the adapter does not answer; going on without"),
+    if let Ok(first) = timeout(ANSWER_TIME, answer).await {
+        opening.first = first?;
+        opening.answered = true;
+    } else {
+        tracing::debug!(command, "the adapter does not answer; going on without");
     }
     Ok(())
+}
+
+fn refusal(command: &str) -> String {
+    if command == "L" {
+        "the adapter refuses to listen only (`L`), as the passive role demands; opened with `O` it would acknowledge \
+         frames, and disturb the bus at a wrong bit rate: use an adapter that knows `L`"
+            .to_owned()
+    } else {
+        format!("the adapter refuses the command `{command}`")
+    }
 }
 
 fn closed() -> Failure {

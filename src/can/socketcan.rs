@@ -193,7 +193,9 @@ impl SocketReader {
         if host.index != self.index {
             return Err(self.absent(io::Error::other("it was deleted, and another took its name")));
         }
-        self.intake.tally.bit_rate = host.bit_rate.or(self.intake.tally.bit_rate);
+        let tally = &mut self.intake.tally;
+        tally.bit_rate = host.bit_rate.or(tally.bit_rate);
+        tally.listens_only = host.listens_only.or(tally.listens_only);
         let tracker = &mut self.intake.tracker;
         let change = match host.observation {
             Some(observation) => tracker.handle_observation(asked, observation),

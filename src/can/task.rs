@@ -29,17 +29,19 @@ const REPORT_EVERY: Duration = Duration::from_secs(1);
 
 /// Runs one bus until `stop`, or until the gateway is gone.
 ///
+/// `listen_only` is as with [`open`]; where an interface of the host acknowledges frames all the same, that is logged.
 /// `events` is awaited when it is full. Frames are taken from `transmit` one after another.
 pub async fn run(
     bus: BusIndex,
     interface: Interface,
+    listen_only: bool,
     events: mpsc::Sender<(BusIndex, BusEvent)>,
     transmit: mpsc::Receiver<CanFrame>,
     clock: Clock,
     stop: CancellationToken,
 ) {
-    let ends = Ends { bus, name: interface.to_string(), events, transmit, clock, stop };
-    run_with(|| open(&interface, clock), longest_wait(&interface), ends).await;
+    let ends = Ends { bus, name: interface.to_string(), listen_only, events, transmit, clock, stop };
+    run_with(|| open(&interface, listen_only, clock), longest_wait(&interface), ends).await;
 }
 
 /// An interface that was re-created is found within a second; a far host is not called that often.
@@ -58,6 +60,8 @@ pub struct Ends {
     pub bus: BusIndex,
     /// The interface as the user wrote it, for the log.
     pub name: String,
+    /// Nothing may leave, not even the acknowledging of frames.
+    pub listen_only: bool,
     /// To the gateway.
     pub events: mpsc::Sender<(BusIndex, BusEvent)>,
     /// From the gateway.
@@ -74,8 +78,8 @@ pub async fn run_with<R: BusReader, W: BusWriter>(
     longest_wait: Duration,
     ends: Ends,
 ) {
-    let Ends { bus, name, events, transmit, clock, stop } = ends;
-    let desk = Desk { bus, name, events, clock, state: Mutex::default() };
+    let Ends { bus, name, listen_only, events, transmit, clock, stop } = ends;
+    let desk = Desk { bus, name, listen_only, events, clock, state: Mutex::default() };
     let writer = tokio::sync::Mutex::new(None);
     tokio::select! {
         Err(GatewayGone) = read_for_ever(&desk, &writer, open, longest_wait) => {}
@@ -91,6 +95,7 @@ struct GatewayGone;
 struct Desk {
     bus: BusIndex,
     name: String,
+    listen_only: bool,
     events: mpsc::Sender<(BusIndex, BusEvent)>,
     clock: Clock,
     state: Mutex<State>,
@@ -191,7 +196,7 @@ impl Desk {
             error_frames: counters.error_frames,
             fd_frames: counters.fd_frames,
             overruns: counters.overruns,
-            bit_rate: None,
+            ..Tally::default()
         };
     }
 }
@@ -247,6 +252,7 @@ struct Log {
     outage: Outage,
     passive: Repeats,
     suspected_bit_rate: bool,
+    told_of_acknowledging: bool,
 }
 
 /// From one opening of the bus to its failure.
@@ -272,7 +278,17 @@ impl Session<'_> {
                     Err(error) => return Ok(error),
                 }
             };
-            let lost_frames = self.desk.take_tally(reader.tally());
+            let tally = reader.tally();
+            if self.desk.listen_only && self.log.is_acknowledging_news(tally.listens_only) {
+                tracing::warn!(
+                    interface = self.desk.name,
+                    "the passive role sends no frame, but this interface acknowledges those of others, and disturbs the \
+                     bus at a wrong bit rate; where the controller can, `ip link set {0} down` and \
+                     `ip link set {0} up type can listen-only on`",
+                    self.desk.name
+                );
+            }
+            let lost_frames = self.desk.take_tally(tally);
             if event.is_none() {
                 self.log.handle_timeout(&self.desk.name, self.desk.clock.now().instant);
             }
@@ -344,6 +360,11 @@ impl Log {
     fn handle_error(&mut self, interface: &str, error: &BusError, now: Instant) {
         let reason = format!("{error}; trying again until it works");
         write(interface, self.outage.handle_down(&reason, now));
+    }
+
+    /// Whether to tell that an interface that should only listen acknowledges frames. Once is enough.
+    fn is_acknowledging_news(&mut self, listens_only: Option<bool>) -> bool {
+        listens_only == Some(false) && !std::mem::replace(&mut self.told_of_acknowledging, true)
     }
 
     fn handle_timeout(&mut self, interface: &str, now: Instant) {

@@ -79,8 +79,15 @@ fn run_on(openings: Vec<Result<(FakeReader, FakeWriter), BusError>>) -> Harness 
     let (stop, clock) = (CancellationToken::new(), Clock::start());
     let mut openings = VecDeque::from(openings);
     let open = move || openings.pop_front().unwrap_or_else(|| Err(absent()));
-    let ends =
-        Ends { bus: BusIndex(3), name: "fake".into(), events, transmit: to_send, clock, stop: stop.clone() };
+    let ends = Ends {
+        bus: BusIndex(3),
+        name: "fake".into(),
+        listen_only: false,
+        events,
+        transmit: to_send,
+        clock,
+        stop: stop.clone(),
+    };
     let task = tokio::spawn(run_with(open, LONGEST, ends));
     Harness { events: told, transmit, stop, clock, task }
 }
@@ -210,11 +217,11 @@ async fn counters_go_on_over_a_new_opening() {
     let (second, again) = fake_bus();
     let mut harness = run_on(vec![Ok(bus), Ok(again)]);
     *first.tally.lock().unwrap() =
-        Tally { error_frames: 5, fd_frames: 2, overruns: 7, bit_rate: Some(125_000) };
+        Tally { error_frames: 5, fd_frames: 2, overruns: 7, bit_rate: Some(125_000), ..Tally::default() };
     first.script.send(Ok(link(Link::ErrorActive))).await.unwrap();
     first.script.send(Ok(received("181#01"))).await.unwrap();
     first.script.send(Err(absent())).await.unwrap();
-    *second.tally.lock().unwrap() = Tally { error_frames: 1, fd_frames: 1, overruns: 1, bit_rate: None };
+    *second.tally.lock().unwrap() = Tally { error_frames: 1, fd_frames: 1, overruns: 1, ..Tally::default() };
     second.script.send(Ok(link(Link::ErrorActive))).await.unwrap();
     second.script.send(Ok(received("181#01"))).await.unwrap();
     for _ in 0..5 {
@@ -292,7 +299,15 @@ async fn openings_of_a_bus_that_works_for(each: Duration) -> Vec<u64> {
     let (events, mut told) = mpsc::channel(1_024);
     let (_transmit, to_send) = mpsc::channel(64);
     let stop = CancellationToken::new();
-    let ends = Ends { bus: BusIndex(0), name: "fake".into(), events, transmit: to_send, clock, stop };
+    let ends = Ends {
+        bus: BusIndex(0),
+        name: "fake".into(),
+        listen_only: false,
+        events,
+        transmit: to_send,
+        clock,
+        stop,
+    };
     let _task = tokio_util::task::AbortOnDropHandle::new(tokio::spawn(run_with(open, LONGEST, ends)));
     while opened.lock().unwrap().len() < 6 {
         told.recv().await.unwrap();
@@ -339,7 +354,15 @@ async fn reading_goes_on_while_a_send_hangs() {
     let mut opening = Some((reader, Hanging));
     let open = move || opening.take().ok_or_else(absent);
     let name = "fake".to_owned();
-    let ends = Ends { bus: BusIndex(0), name, events, transmit: to_send, clock: Clock::start(), stop };
+    let ends = Ends {
+        bus: BusIndex(0),
+        name,
+        listen_only: false,
+        events,
+        transmit: to_send,
+        clock: Clock::start(),
+        stop,
+    };
     let _task = tokio::spawn(run_with(open, LONGEST, ends));
     stage.script.send(Ok(link(Link::ErrorActive))).await.unwrap();
     transmit.send(frame("701#R1")).await.unwrap();
@@ -351,6 +374,15 @@ async fn reading_goes_on_while_a_send_hangs() {
     while frames < 100 {
         frames += u32::from(matches!(told.recv().await.unwrap().1, BusEvent::Frame { .. }));
     }
+}
+
+#[test]
+fn an_interface_that_acknowledges_in_the_passive_role_is_told_of_once() {
+    let mut log = Log::default();
+    assert!(!log.is_acknowledging_news(None), "no controller, or nothing is known");
+    assert!(!log.is_acknowledging_news(Some(true)));
+    assert!(log.is_acknowledging_news(Some(false)));
+    assert!(!log.is_acknowledging_news(Some(false)));
 }
 
 #[tokio::test(start_paused = true)]
@@ -375,7 +407,7 @@ async fn a_virtual_bus_is_run_by_the_same_task() {
     let stop = CancellationToken::new();
     let ours = bus.clone();
     let name = "virtual:test".to_owned();
-    let ends = Ends { bus: BusIndex(0), name, events, transmit: to_send, clock, stop };
+    let ends = Ends { bus: BusIndex(0), name, listen_only: false, events, transmit: to_send, clock, stop };
     let _task = tokio::spawn(run_with(move || Ok(ours.join(clock)), LONGEST, ends));
     let (mut reader, mut writer) = bus.join(clock);
     while !matches!(told.recv().await.unwrap().1, BusEvent::Link { link: Link::ErrorActive, .. }) {}

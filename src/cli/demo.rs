@@ -92,7 +92,7 @@ async fn simulate(clock: Clock, stop: CancellationToken) {
     let (transmit, to_send) = mpsc::channel(QUEUE);
     // No orders: the demo tells its story by itself.
     let (_, lines) = mpsc::channel(1);
-    let bus = can::task::run(BusIndex(0), interface, events_to_us, to_send, clock, stop.clone());
+    let bus = can::task::run(BusIndex(0), interface, false, events_to_us, to_send, clock, stop.clone());
     let end = BusEnd { events, transmit };
     tokio::join!(bus, simulator::task::run(simulator::demo(), end, lines, std::io::sink(), clock, stop));
 }

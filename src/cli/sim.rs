@@ -154,7 +154,8 @@ pub async fn run(
             }
         }
     });
-    let bus = can::task::run(BusIndex(0), options.interface, events_to_us, to_send, clock, stop.clone());
+    let bus =
+        can::task::run(BusIndex(0), options.interface, false, events_to_us, to_send, clock, stop.clone());
     let devices = task::run(plans, BusEnd { events, transmit }, lines, report, clock, stop);
     tokio::join!(bus, devices);
     Ok(())

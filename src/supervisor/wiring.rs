@@ -154,6 +154,7 @@ impl Bound {
             let bus = can::task::run(
                 BusIndex(index),
                 interface.clone(),
+                false,
                 events.clone(),
                 frame_queue,
                 self.clock,

@@ -70,7 +70,7 @@ struct Bus {
 
 impl Bus {
     fn open(name: &str, clock: Clock) -> Self {
-        let (reader, writer) = open(&Interface::SocketCan(name.to_owned()), clock).unwrap();
+        let (reader, writer) = open(&Interface::SocketCan(name.to_owned()), false, clock).unwrap();
         Self { reader, writer }
     }
 
@@ -138,7 +138,8 @@ fn a_frame_is_stamped_with_the_time_at_which_the_kernel_received_it() {
 #[test]
 fn an_interface_that_is_not_there_and_one_that_is_no_can_are_refused() {
     alone(async {
-        let refused = |name: &str| open(&Interface::SocketCan(name.into()), Clock::start()).unwrap_err();
+        let refused =
+            |name: &str| open(&Interface::SocketCan(name.into()), false, Clock::start()).unwrap_err();
         assert!(matches!(refused("nosuch0"), BusError::Absent { .. }));
         assert!(refused("lo").to_string().contains("no CAN interface"), "{}", refused("lo"));
     });
@@ -280,7 +281,7 @@ impl Task {
         let (transmit, to_send) = mpsc::channel(64);
         let stop = CancellationToken::new();
         let interface: Interface = interface.parse().unwrap();
-        tokio::spawn(task::run(BusIndex(0), interface, events, to_send, Clock::start(), stop.clone()));
+        tokio::spawn(task::run(BusIndex(0), interface, false, events, to_send, Clock::start(), stop.clone()));
         Self { events: told, transmit, stop }
     }
 
