@@ -10,7 +10,7 @@ use nix::unistd::Pid;
 use tokio_modbus::client::{Context, Reader, tcp};
 use tokio_modbus::slave::Slave;
 
-use crate::support::until;
+use crate::support::{PATIENCE, until};
 
 /// The program under test.
 fn cangate() -> Command {
@@ -142,6 +142,24 @@ async fn without_can_and_without_a_broker_modbus_answers_with_invalid_values_and
     gateway.signal(Signal::SIGTERM);
     let (code, said) = tokio::task::spawn_blocking(move || gateway.wait()).await.unwrap();
     assert_eq!(code, Some(0), "{said}");
+}
+
+#[test]
+fn the_passive_role_and_only_it_opens_an_adapter_to_listen_only() {
+    for (role, opening) in [("passive", "L"), ("master", "O")] {
+        let adapter = TcpListener::bind("127.0.0.1:0").unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        // Two lines of the file in the place of one.
+        let bus = format!("slcan+tcp://{}\"\nrole = \"{role}", adapter.local_addr().unwrap());
+        let file = configuration(folder.path(), &bus, free_address(), free_address());
+        let _gateway = Running::start(cangate().args(["run", "-c", file.to_str().unwrap()]));
+        let (stream, _) = adapter.accept().unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        let commands =
+            BufReader::new(stream).split(b'\r').map(|line| String::from_utf8(line.unwrap()).unwrap());
+        let commands: Vec<String> = commands.filter(|line| !line.is_empty()).take(2).collect();
+        assert_eq!(commands, ["C", opening], "{role}");
+    }
 }
 
 #[tokio::test]

@@ -12,6 +12,7 @@ use super::tasks::{Ended, Tasks};
 use super::{health, readings};
 use crate::can::interface::Interface;
 use crate::can::{self, BusIndex};
+use crate::canopen::Role;
 use crate::gateway::{self, Gateway, Health};
 use crate::mapping::TagTable;
 use crate::modbus::gateway_block::MAP_VERSION;
@@ -151,10 +152,11 @@ impl Bound {
         for (index, interface) in self.installation.interfaces.iter().enumerate() {
             let (frames, frame_queue) = mpsc::channel(TRANSMIT);
             transmit.push(frames);
+            let role = self.installation.table.buses.get(index).map(|bus| bus.role);
             let bus = can::task::run(
                 BusIndex(index),
                 interface.clone(),
-                false,
+                role == Some(Role::Passive),
                 events.clone(),
                 frame_queue,
                 self.clock,
