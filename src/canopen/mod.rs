@@ -10,6 +10,8 @@
 //! - [`cob_id`]: node ids and identifiers.
 //! - [`nmt`]: states and commands.
 //! - [`settings`]: what a network and its nodes are to do.
+//! - [`object`]: objects of an object dictionary, and their values as text.
+//! - [`sdo`]: reads and writes them; [`lss`]: gives devices node ids and bit rates.
 //! - [`event`]: what a network tells.
 //! - `guarding`, `heartbeat`, `start`, `pdo`, `duplicate`: one machine each, for one node.
 //! - `node`: one node, made of those machines; `reception`: what its frames mean for it.
@@ -20,12 +22,15 @@ mod duplicate;
 pub mod event;
 mod guarding;
 mod heartbeat;
+pub mod lss;
 pub mod network;
 pub mod nmt;
 mod node;
+pub mod object;
 mod outputs;
 mod pdo;
 mod reception;
+pub mod sdo;
 pub mod settings;
 mod start;
 
