@@ -329,15 +329,12 @@ fn unsigned(bytes: &[u8]) -> u64 {
 
 fn escape(characters: impl Iterator<Item = char>) -> String {
     let text: String = characters.collect();
-    let mut shown = String::with_capacity(text.len());
-    for character in text.trim_end_matches('\0').chars() {
-        match character {
-            '\\' => shown.push_str("\\\\"),
-            _ if character.is_control() => shown.push_str(&format!("\\x{:02X}", u32::from(character))),
-            _ => shown.push(character),
-        }
-    }
-    shown
+    let shown = text.trim_end_matches('\0').chars().map(|character| match character {
+        '\\' => "\\\\".to_owned(),
+        _ if character.is_control() => format!("\\x{:02X}", u32::from(character)),
+        _ => character.to_string(),
+    });
+    shown.collect()
 }
 
 /// The reverse of [`escape`]; `None` after a backslash that escapes nothing.
