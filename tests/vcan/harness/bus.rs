@@ -13,7 +13,14 @@ pub const BUS: &str = "vcan0";
 static IN_USE: Mutex<()> = Mutex::new(());
 
 /// Waits until no other test runs, and leaves the bus as a new one.
+///
+/// Deletes vcan0, and tests after it make routes between interfaces: outside the runner that would be the host's own.
 pub fn take_the_bus() -> MutexGuard<'static, ()> {
+    assert!(
+        std::env::var_os("CANGATE_VCAN").is_some(),
+        "these tests delete and make CAN interfaces, so they run only where no one else uses them: by `tests/all vcan`, \
+         or one of them as docs/testing.md says under \"One test\""
+    );
     let guard = IN_USE.lock().unwrap_or_else(PoisonError::into_inner);
     let _ = run("ip", &["link", "del", BUS]);
     create_interface();
