@@ -12,21 +12,41 @@ pub enum Severity {
     Error,
 }
 
-/// One message: `file:line:column: error: message`, then the hint on a line of its own.
+/// One message: `file:line:column: error: message`, then the hint on a line of its own. What has no lines, as an
+/// environment variable, is told without them.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Diagnostic {
     /// Error or warning.
     pub severity: Severity,
     /// Path as the user gave it.
     pub file: String,
-    /// 1-based.
+    /// 1-based; 0 where there are no lines.
     pub line: usize,
-    /// 1-based, in characters.
+    /// 1-based, in characters; 0 where there are no lines.
     pub column: usize,
     /// What is wrong.
     pub message: String,
     /// How to mend it.
     pub hint: String,
+}
+
+impl Diagnostic {
+    /// An error in something that has no lines.
+    #[must_use]
+    pub fn without_place(
+        what: impl Into<String>,
+        message: impl Into<String>,
+        hint: impl Into<String>,
+    ) -> Self {
+        Self {
+            severity: Severity::Error,
+            file: what.into(),
+            line: 0,
+            column: 0,
+            message: message.into(),
+            hint: hint.into(),
+        }
+    }
 }
 
 impl fmt::Display for Diagnostic {
@@ -35,7 +55,11 @@ impl fmt::Display for Diagnostic {
             Severity::Warning => "warning",
             Severity::Error => "error",
         };
-        write!(f, "{}:{}:{}: {severity}: {}", self.file, self.line, self.column, self.message)?;
+        write!(f, "{}", self.file)?;
+        if self.line > 0 {
+            write!(f, ":{}:{}", self.line, self.column)?;
+        }
+        write!(f, ": {severity}: {}", self.message)?;
         if !self.hint.is_empty() {
             write!(f, "\n  hint: {}", self.hint)?;
         }
@@ -118,5 +142,7 @@ mod tests {
         let source = SourceText::new("m.toml", "a = 1\nb = 2\n");
         let text = source.error(&(6..7), "unknown key `b`", "known keys are: a").to_string();
         assert_eq!(text, "m.toml:2:1: error: unknown key `b`\n  hint: known keys are: a");
+        let text = Diagnostic::without_place("variable X", "it is empty", "").to_string();
+        assert_eq!(text, "variable X: error: it is empty");
     }
 }

@@ -59,7 +59,7 @@ pub struct Installation<'a> {
     pub nodes: &'a BTreeMap<At<String>, NodeEntry>,
     /// Mapping files by the name that nodes call them; one that is missing here is looked for among the shipped ones.
     pub mappings: &'a BTreeMap<String, SourceText>,
-    /// Names of buses whose entries could not be read: that they are missing is not told again.
+    /// Names of buses and mappings that could not be read: that they are missing is not told again.
     pub lost: &'a [String],
 }
 
@@ -148,7 +148,9 @@ fn mapping_files(problems: &mut Problems, installation: &Installation<'_>) -> BT
         let source = own.or_else(|| {
             shipped(&name.value).map(|text| SourceText::new(format!("mappings/{}.toml", name.value), text))
         });
-        if let Some(source) = source {
+        if let Some(source) = source
+            && !installation.lost.contains(&name.value)
+        {
             let mut read = reader::read::<MappingFile>(&source);
             problems.extend(read.problems.drain(..));
             if let Some(file) = &read.content
@@ -191,6 +193,9 @@ impl Builder<'_> {
         let unit_id = self.unit_id(problems, entry);
         let Some(mapping) = files.get(&entry.mapping.value) else {
             let mapping = &entry.mapping;
+            if self.installation.lost.contains(&mapping.value) {
+                return;
+            }
             let message = format!("there is no mapping `{}`", mapping.value);
             let hint = match closest(&mapping.value, SHIPPED.iter().map(|(name, _)| *name)) {
                 Some(close) => format!("did you mean `{close}`?"),
