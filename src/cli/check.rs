@@ -1,7 +1,8 @@
 //! `cangate check FILE...`: everything that is wrong with configuration and mapping files \[IO\].
 
+use std::ffi::OsString;
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use super::Exit;
 use super::args::CheckArguments;
@@ -16,13 +17,25 @@ pub struct Report {
     pub problems: Vec<Diagnostic>,
     /// Files that were looked at.
     pub files: usize,
+    /// One of them could not be read.
+    pub unreadable: bool,
 }
 
 impl Report {
-    /// Whether there is an error: the exit code is then 78.
+    /// Whether there is an error.
     #[must_use]
     pub fn has_errors(&self) -> bool {
         self.count(Severity::Error) > 0
+    }
+
+    /// 74 when a file could not be read, for then not all was checked; 78 when there is an error.
+    #[must_use]
+    pub fn exit(&self) -> Exit {
+        match (self.unreadable, self.has_errors()) {
+            (true, _) => Exit::Io,
+            (false, true) => Exit::Configuration,
+            (false, false) => Exit::Ok,
+        }
     }
 
     fn count(&self, severity: Severity) -> usize {
@@ -48,42 +61,42 @@ impl fmt::Display for Report {
 
 /// Prints the report: on standard output when all is well, on standard error when not.
 pub(super) fn run(arguments: &CheckArguments) -> Exit {
-    let variables: Vec<(String, String)> = std::env::vars().collect();
+    let variables: Vec<(OsString, OsString)> = std::env::vars_os().collect();
     let report = check(&arguments.files, &variables);
     if report.problems.is_empty() {
         print_line(&report.to_string());
     } else {
         print_text(&report.to_string());
     }
-    if report.has_errors() { Exit::Configuration } else { Exit::Ok }
+    report.exit()
 }
 
 /// Checks configuration files (with the mappings that they use, and the environment's `CANGATE__` variables over them) and
 /// mapping files, told apart by their content.
 #[must_use]
-pub fn check(files: &[PathBuf], variables: &[(String, String)]) -> Report {
-    let problems = files.iter().flat_map(|file| check_file(file, variables)).collect();
-    Report { problems, files: files.len() }
+pub fn check(files: &[PathBuf], variables: &[(OsString, OsString)]) -> Report {
+    let mut report = Report { files: files.len(), ..Report::default() };
+    for file in files {
+        let name = file.display().to_string();
+        match std::fs::read_to_string(file) {
+            Ok(text) => report.problems.extend(check_text(&SourceText::new(name, text), variables)),
+            Err(error) => {
+                let hint = "give the name of a configuration or mapping file";
+                let message = format!("cannot read this file: {error}");
+                report.problems.push(Diagnostic::without_place(name, message, hint));
+                report.unreadable = true;
+            }
+        }
+    }
+    report
 }
 
-fn check_file(file: &Path, variables: &[(String, String)]) -> Vec<Diagnostic> {
-    let name = file.display().to_string();
-    let source = match std::fs::read_to_string(file) {
-        Ok(text) => SourceText::new(name, text),
-        Err(error) => {
-            let hint = "give the name of a configuration or mapping file";
-            return vec![SourceText::new(name, "").error(
-                &(0..0),
-                format!("cannot read this file: {error}"),
-                hint,
-            )];
-        }
-    };
-    let found = if is_mapping(&source) {
-        check_mapping(&source)
+fn check_text(source: &SourceText, variables: &[(OsString, OsString)]) -> Vec<Diagnostic> {
+    let found = if is_mapping(source) {
+        check_mapping(source)
     } else {
         let mut read_file = |path: &str| std::fs::read_to_string(path);
-        config::load(&source, variables.iter().cloned(), &mut read_file).map(|loaded| loaded.warnings)
+        config::load(source, variables.iter().cloned(), &mut read_file).map(|loaded| loaded.warnings)
     };
     found.unwrap_or_else(|problems| problems)
 }
@@ -123,12 +136,13 @@ mod tests {
         let mapping = "format = 1\n[device]\nvendor = 'x'\n";
         let (folder, mut paths) = folder(&[("cangate.toml", CONFIG), ("mappings/own.toml", mapping)]);
         paths.push(folder.path().join("none.toml"));
-        let report = check(&paths, &[("CANGATE__X__Y".to_owned(), "1".to_owned())]);
-        assert!(report.has_errors());
+        let report = check(&paths, &[("CANGATE__X__Y".into(), "1".into())]);
+        assert_eq!(report.exit(), Exit::Io, "not all could be checked");
+        assert_eq!(check(&paths[..2], &[]).exit(), Exit::Configuration);
         let text = report.to_string();
         assert!(text.contains("CANGATE__X__Y"), "{text}");
         assert!(text.contains("own.toml:2:1: error: key `model` is missing"), "{text}");
-        assert!(text.contains("none.toml:1:1: error: cannot read this file"), "{text}");
+        assert!(text.contains("none.toml: error: cannot read this file"), "{text}");
         assert!(text.ends_with("3 files checked: 4 errors, 0 warnings"), "{text}");
     }
 }

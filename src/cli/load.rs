@@ -1,5 +1,6 @@
 //! Reads the configuration and its mapping files, and says what is wrong with them. \[IO\]
 
+use std::ffi::OsString;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -13,7 +14,7 @@ use crate::supervisor::Installation;
 /// What a configuration file says, checked; warnings are printed. Else everything that is wrong is printed.
 pub(super) fn configuration(file: &Path) -> Result<Loaded, Exit> {
     let source = SourceText::new(file.display().to_string(), read_file(file)?);
-    load(&source, std::env::vars())
+    load(&source, std::env::vars_os())
 }
 
 /// The same, made into what the supervisor starts.
@@ -35,7 +36,10 @@ pub(super) fn register_map(loaded: &Loaded) -> Result<RegisterMap, Exit> {
     })
 }
 
-fn load(source: &SourceText, variables: impl IntoIterator<Item = (String, String)>) -> Result<Loaded, Exit> {
+fn load(
+    source: &SourceText,
+    variables: impl IntoIterator<Item = (OsString, OsString)>,
+) -> Result<Loaded, Exit> {
     let loaded = config::load(source, variables, &mut |path| std::fs::read_to_string(path));
     match loaded {
         Ok(loaded) => {

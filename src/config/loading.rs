@@ -1,10 +1,11 @@
 //! From the text of the configuration to checked settings and the tag table, or to everything that is wrong.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::io;
 use std::path::Path;
 
-use super::environment;
+use super::environment::{self, Overlay};
 use super::settings::Settings;
 use crate::can::interface::Interface;
 use crate::mapping::{
@@ -35,7 +36,7 @@ pub struct Loaded {
 /// is `mappings/NAME.toml` beside the configuration file, or else the one that comes with the program.
 pub fn load(
     source: &SourceText,
-    variables: impl IntoIterator<Item = (String, String)>,
+    variables: impl IntoIterator<Item = (OsString, OsString)>,
     read_file: &mut dyn FnMut(&str) -> io::Result<String>,
 ) -> Result<Loaded, Vec<Diagnostic>> {
     let read = reader::read::<Settings>(source);
@@ -45,11 +46,13 @@ pub fn load(
         let message = format!("version {} is not known to this program", settings.version.value);
         problems.push(source.error(&settings.version.span, message, format!("it reads version {VERSION}")));
     }
-    problems.extend(environment::overlay(&mut settings, variables));
-    problems.extend(check(source, &settings));
+    let mut overlay = environment::overlay(&mut settings, variables);
+    problems.append(&mut overlay.problems);
+    problems.extend(check(source, &settings, &overlay));
     let (interfaces, wrong) = interfaces(source, &settings);
     problems.extend(wrong);
-    let (mappings, wrong) = mappings(source, &settings, read_file);
+    let mut lost = read.lost;
+    let (mappings, wrong) = mappings(source, &settings, read_file, &mut lost);
     problems.extend(wrong);
     let installation = Installation {
         gateway: &settings.gateway.name,
@@ -58,7 +61,7 @@ pub fn load(
         buses: &settings.bus,
         nodes: &settings.node,
         mappings: &mappings,
-        lost: &read.lost,
+        lost: &lost,
     };
     match build(&installation) {
         Ok((table, mut warnings)) if problems.is_empty() => {
@@ -76,17 +79,22 @@ pub fn load(
 }
 
 /// What the rooms' settings say of themselves, and what only holds for several of them together.
-fn check(source: &SourceText, settings: &Settings) -> Vec<Diagnostic> {
+fn check(source: &SourceText, settings: &Settings, overlay: &Overlay) -> Vec<Diagnostic> {
     let mut problems = Vec::new();
+    // A value that a variable set is nowhere in the file.
+    let mut tell = |table: &str, key: &str, message: String, hint: String| {
+        problems.push(match overlay.variable(table, key) {
+            Some(variable) => environment::problem(variable, message, hint),
+            None => source.error(&locate(source, &[table, key]), message, hint),
+        });
+    };
     if !is_name(&settings.gateway.name) {
         let message = format!("`{}` cannot be the name of a gateway", settings.gateway.name);
-        let span = locate(source, &["gateway", "name"]);
-        problems.push(source.error(&span, message, "use 1 to 64 of a-z, 0-9, _ and -"));
+        tell("gateway", "name", message, "use 1 to 64 of a-z, 0-9, _ and -".to_owned());
     }
     for problem in settings.modbus.problems() {
-        let span = locate(source, &["modbus", problem.key]);
         let hint = format!("use {} to {}", problem.lowest, problem.highest);
-        problems.push(source.error(&span, problem.to_string(), hint));
+        tell("modbus", problem.key, problem.to_string(), hint);
     }
     for name in settings.node.keys().filter(|name| RESERVED_NODE_NAMES.contains(&name.value.as_str())) {
         let message = format!("`{}` cannot be the name of a node", name.value);
@@ -133,11 +141,12 @@ fn mappings(
     source: &SourceText,
     settings: &Settings,
     read_file: &mut dyn FnMut(&str) -> io::Result<String>,
+    lost: &mut Vec<String>,
 ) -> (BTreeMap<String, SourceText>, Vec<Diagnostic>) {
     let mut mappings = BTreeMap::new();
     let mut problems = Vec::new();
     for mapping in settings.node.values().map(|node| &node.mapping) {
-        if mappings.contains_key(&mapping.value) {
+        if mappings.contains_key(&mapping.value) || lost.contains(&mapping.value) {
             continue;
         }
         let path = mapping_path(&source.name, &mapping.value);
@@ -150,10 +159,8 @@ fn mappings(
             Err(error) => {
                 let message = format!("cannot read the mapping {path}: {error}");
                 problems.push(source.error(&mapping.span, message, shipped_hint()));
-                // Keeps `build` from telling the same again; an empty text would be a problem of its own.
-                if let Some((_, any)) = shipped::SHIPPED.first() {
-                    mappings.insert(mapping.value.clone(), SourceText::new(path, *any));
-                }
+                // What its nodes say of tags and alarms cannot be checked; that is nobody's mistake.
+                lost.push(mapping.value.clone());
             }
         }
     }
@@ -232,6 +239,35 @@ mapping = "motortech-detcon"
             problems[0]
                 .starts_with("etc/cangate.toml:10:11: error: cannot read the mapping etc/./own.toml: ")
         );
+    }
+
+    #[test]
+    fn what_a_node_changes_of_a_mapping_that_cannot_be_read_is_no_mistake() {
+        let text = TWO_ENGINES
+            .replace("mapping = \"motortech-detcon\"", "mapping = \"./own.toml\"\nunit_id = 248")
+            + "[node.engine2.tag.pressure]\ninvert = true\n[node.engine2.parameters]\nfull_scale = 10\n";
+        let problems = read(&text, &[]).unwrap_err();
+        let told = |part: &str| problems.iter().filter(|problem| problem.contains(part)).count();
+        assert_eq!(told("cannot read the mapping"), 1, "{problems:#?}");
+        assert_eq!(told("unit_id 248 is out of range"), 2, "the nodes themselves are checked: {problems:#?}");
+        assert_eq!(problems.len(), 3, "{problems:#?}");
+    }
+
+    #[test]
+    fn what_a_variable_says_is_not_blamed_on_the_file() {
+        let text = format!("{TWO_ENGINES}[modbus]\nmax_connections = 8\n");
+        let variables = [("CANGATE__GATEWAY__NAME", "Hall 1"), ("CANGATE__MODBUS__MAX_CONNECTIONS", "0")];
+        let source = SourceText::new("etc/cangate.toml", text);
+        let variables = variables.map(|(name, value)| (name.into(), value.into()));
+        let problems = load(&source, variables, &mut |_| Err(io::ErrorKind::NotFound.into())).unwrap_err();
+        let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        assert_eq!(problems.len(), 2, "{problems:#?}");
+        assert!(
+            problems[0].starts_with("environment variable CANGATE__GATEWAY__NAME: error: `Hall 1` cannot")
+        );
+        assert!(problems[1].starts_with(
+            "environment variable CANGATE__MODBUS__MAX_CONNECTIONS: error: `max_connections` is 0"
+        ));
     }
 
     #[test]
