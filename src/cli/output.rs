@@ -2,6 +2,7 @@
 
 use std::io::{self, Write};
 use std::path::Path;
+use std::time::Duration;
 
 use super::Exit;
 use crate::mapping::Diagnostic;
@@ -58,13 +59,51 @@ pub(super) fn read_file(path: &Path) -> Result<String, Exit> {
     })
 }
 
-/// Runs a future on a new runtime.
+/// How long the end waits for threads that are held up in the system: one that asks a name server which does not answer
+/// would hold the process for half a minute.
+const LEAVE_BEHIND: Duration = Duration::from_millis(500);
+
+/// Runs a future on a new runtime. What still runs when it ends is left behind.
 pub(super) fn block_on(future: impl Future<Output = Exit>) -> Exit {
     match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
-        Ok(runtime) => runtime.block_on(future),
+        Ok(runtime) => {
+            let exit = runtime.block_on(future);
+            runtime.shutdown_timeout(LEAVE_BEHIND);
+            exit
+        }
         Err(error) => {
             print_error(&format!("the runtime cannot be started: {error}"));
             Exit::Io
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering};
+    use std::sync::mpsc;
+
+    use super::*;
+
+    #[test]
+    fn a_thread_that_is_held_up_does_not_hold_up_the_end() {
+        let (release, held) = mpsc::channel::<()>();
+        let over = Arc::new(AtomicBool::new(false));
+        let told = Arc::clone(&over);
+        let exit = block_on(async move {
+            let (begun, begins) = tokio::sync::oneshot::channel();
+            tokio::task::spawn_blocking(move || {
+                begun.send(()).unwrap();
+                // As getaddrinfo does; long, so that a runtime that waits fails this test instead of hanging in it.
+                let _ = held.recv_timeout(Duration::from_secs(60));
+                told.store(true, Ordering::SeqCst);
+            });
+            begins.await.unwrap();
+            Exit::Ok
+        });
+        assert_eq!(exit, Exit::Ok);
+        assert!(!over.load(Ordering::SeqCst), "the thread was waited for");
+        drop(release);
     }
 }

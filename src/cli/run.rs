@@ -5,7 +5,7 @@ use tokio_util::sync::CancellationToken;
 use super::args::RunArguments;
 use super::output::{block_on, print_error};
 use super::{Exit, load};
-use crate::supervisor::{self, Ended, Installation, shutdown};
+use crate::supervisor::{self, Ended, Installation, Tasks, shutdown};
 use crate::time::Clock;
 
 /// Runs until a signal.
@@ -24,7 +24,7 @@ async fn serve(installation: Installation) -> Exit {
         return Exit::Io;
     }
     match supervisor::bind(installation, Clock::start()).await {
-        Ok(bound) => ended(&bound.run(stop).await),
+        Ok(bound) => ended(&bound.run(Tasks::default(), stop).await),
         Err(error) => {
             print_error(&error.to_string());
             Exit::Io

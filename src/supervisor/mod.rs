@@ -15,5 +15,5 @@ pub mod shutdown;
 pub mod tasks;
 pub mod wiring;
 
-pub use tasks::Ended;
+pub use tasks::{Ended, Tasks};
 pub use wiring::{Bound, Installation, StartError, bind};

@@ -39,21 +39,18 @@ impl Tasks {
     }
 
     /// Waits until `stop` is cancelled or a task ends by itself; then stops all and waits for them, at most
-    /// [`SHUTDOWN_LIMIT`].
+    /// [`SHUTDOWN_LIMIT`]. A task that panics is a bug at any time, also while it stops.
     pub async fn run(mut self, stop: CancellationToken) -> Ended {
         let early = tokio::select! {
             () = stop.cancelled() => None,
             ended = self.set.join_next_with_id() => ended,
         };
-        let ended = match early {
+        // Told to stop and ended in the same moment: in order, unless it panicked.
+        let early = early.filter(|result| !stop.is_cancelled() || panicked(result));
+        let mut ended = match early {
             None => Ended::Stopped,
-            // Told to stop and ended in the same moment.
-            Some(_) if stop.is_cancelled() => Ended::Stopped,
             Some(result) => {
-                let task = self.name(match &result {
-                    Ok((id, ())) => *id,
-                    Err(error) => error.id(),
-                });
+                let task = self.name(id(&result));
                 error!(
                     task,
                     cause = describe(&result),
@@ -63,27 +60,23 @@ impl Tasks {
             }
         };
         stop.cancel();
-        self.wait_for_the_rest().await;
-        ended
-    }
-
-    async fn wait_for_the_rest(&mut self) {
         let all = async {
             while let Some(result) = self.set.join_next_with_id().await {
-                if let Ok((id, ())) = &result {
-                    debug!(task = self.name(*id), "ended");
-                } else if let Err(error) = &result {
-                    error!(
-                        task = self.name(error.id()),
-                        cause = describe(&result),
-                        "a task panicked while stopping"
-                    );
+                let task = self.name(id(&result));
+                if !panicked(&result) {
+                    debug!(task, "ended");
+                    continue;
+                }
+                error!(task, "a task panicked while stopping: this is a bug in cangate");
+                if ended == Ended::Stopped {
+                    ended = Ended::Bug { task };
                 }
             }
         };
         if tokio::time::timeout(SHUTDOWN_LIMIT, all).await.is_err() {
             error!("some tasks did not end within {} s; leaving them", SHUTDOWN_LIMIT.as_secs());
         }
+        ended
     }
 
     fn name(&self, id: Id) -> String {
@@ -92,6 +85,17 @@ impl Tasks {
             .find(|(known, _)| *known == id)
             .map_or_else(|| "unknown".to_owned(), |(_, name)| name.clone())
     }
+}
+
+fn id(result: &Result<(Id, ()), JoinError>) -> Id {
+    match result {
+        Ok((id, ())) => *id,
+        Err(error) => error.id(),
+    }
+}
+
+fn panicked(result: &Result<(Id, ()), JoinError>) -> bool {
+    result.as_ref().is_err_and(JoinError::is_panic)
 }
 
 fn describe(result: &Result<(Id, ()), JoinError>) -> &'static str {
@@ -132,6 +136,40 @@ mod tests {
         let stop = CancellationToken::new();
         let mut tasks = Tasks::default();
         tasks.spawn("broken", async { panic!("for the test") });
+        assert_eq!(tasks.run(stop).await, Ended::Bug { task: "broken".into() });
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_panic_while_stopping_is_a_bug_too_and_the_first_cause_is_named() {
+        let at_the_stop = |stop: &CancellationToken| {
+            let stop = stop.clone();
+            async move {
+                stop.cancelled().await;
+                panic!("for the test")
+            }
+        };
+        let stop = CancellationToken::new();
+        let mut tasks = Tasks::default();
+        tasks.spawn("steady", stop.clone().cancelled_owned());
+        tasks.spawn("broken", at_the_stop(&stop));
+        stop.cancel();
+        assert_eq!(tasks.run(stop).await, Ended::Bug { task: "broken".into() });
+
+        let stop = CancellationToken::new();
+        let mut tasks = Tasks::default();
+        tasks.spawn("first", async {});
+        tasks.spawn("second", at_the_stop(&stop));
+        assert_eq!(tasks.run(stop).await, Ended::Bug { task: "first".into() });
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_panic_in_the_moment_of_the_stop_is_a_bug() {
+        let stop = CancellationToken::new();
+        let mut tasks = Tasks::default();
+        tasks.spawn("broken", async { panic!("for the test") });
+        // It has ended before anybody looks.
+        tokio::task::yield_now().await;
+        stop.cancel();
         assert_eq!(tasks.run(stop).await, Ended::Bug { task: "broken".into() });
     }
 

@@ -143,10 +143,10 @@ impl Bound {
         self.web.local_addr()
     }
 
-    /// Runs everything until `stop`, or until a bug of ours ends a task.
-    pub async fn run(self, stop: CancellationToken) -> Ended {
+    /// Runs everything until `stop`, or until a bug of ours ends a task. `tasks` are those that already run beside the
+    /// gateway, as the engines of a demo; they are watched like its own.
+    pub async fn run(self, mut tasks: Tasks, stop: CancellationToken) -> Ended {
         self.log_where_it_listens();
-        let mut tasks = Tasks::default();
         let (events, event_queue) = mpsc::channel(BUS_EVENTS);
         let mut transmit = Vec::new();
         for (index, interface) in self.installation.interfaces.iter().enumerate() {
