@@ -2,7 +2,7 @@
 
 use std::net::SocketAddr;
 
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
 use super::args::DemoArguments;
@@ -12,7 +12,7 @@ use crate::can::interface::Interface;
 use crate::can::{self, BusIndex};
 use crate::simulator;
 use crate::simulator::task::BusEnd;
-use crate::supervisor::{self, shutdown};
+use crate::supervisor::{self, Tasks, shutdown};
 use crate::time::Clock;
 
 /// The configuration of the demo; what a user would write for two engines.
@@ -74,13 +74,17 @@ pub(super) fn run(options: &DemoArguments) -> Exit {
                 return Exit::Io;
             }
         };
-        let engines = tokio::spawn(simulate(clock, stop.clone()));
         tell(&bound, &broker);
-        let exit = run::ended(&bound.run(stop.clone()).await);
-        stop.cancel();
-        broker.stop().await;
-        // The engines end with `stop`; what became of them does not matter to the user any more.
-        let _ = engines.await;
+        // A demo whose engines or broker died would go on without a word.
+        let mut tasks = Tasks::default();
+        tasks.spawn("simulated engines", simulate(clock, stop.clone()));
+        let (back, broker_back) = oneshot::channel();
+        tasks.spawn("broker", broker.watch(stop.clone(), back));
+        let exit = run::ended(&bound.run(tasks, stop).await);
+        // After the gateway, so that it can say goodbye.
+        if let Ok(broker) = broker_back.await {
+            broker.stop().await;
+        }
         exit
     })
 }
@@ -162,6 +166,23 @@ impl Broker {
         let address = url.strip_prefix("mqtt://").unwrap_or(&url);
         let (host, port) = address.rsplit_once(':').unwrap_or((address, "1883"));
         (host.trim_matches(['[', ']']).to_owned(), port.to_owned())
+    }
+
+    /// Returns early when the broker ends by itself; else gives it `back` at the stop.
+    async fn watch(mut self, stop: CancellationToken, back: oneshot::Sender<Self>) {
+        let ended = async {
+            match &mut self {
+                #[cfg(feature = "embedded-broker")]
+                Self::Inside(broker) => broker.ended().await,
+                Self::Outside(_) => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            () = ended => return,
+            () = stop.cancelled() => {}
+        }
+        // Nobody takes it back only when the process is about to end anyhow.
+        let _ = back.send(self);
     }
 
     #[cfg_attr(

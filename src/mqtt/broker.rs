@@ -61,6 +61,12 @@ impl EmbeddedBroker {
         self.address
     }
 
+    /// Waits until the broker ends by itself, which it should not.
+    pub async fn ended(&mut self) {
+        // Why, it has told itself; a panic has told it.
+        let _ = (&mut self.task).await;
+    }
+
     /// Ends all connections, then the broker.
     pub async fn shutdown(mut self) {
         self.handle.shutdown();
