@@ -66,12 +66,13 @@ pub enum SimError {
 }
 
 impl SimError {
-    /// 64 for a wrong call, 78 for a wrong file.
+    /// How the command ends.
     #[must_use]
-    pub fn exit_code(&self) -> u8 {
+    pub fn exit(&self) -> Exit {
         match self {
-            Self::NodeIds { .. } => 64,
-            Self::ReadScenario { .. } | Self::Scenario(_) => 78,
+            Self::NodeIds { .. } => Exit::Usage,
+            Self::ReadScenario { .. } => Exit::Io,
+            Self::Scenario(_) => Exit::Configuration,
         }
     }
 }
@@ -102,7 +103,7 @@ pub(super) fn command(arguments: &SimArguments) -> Exit {
             Ok(()) => Exit::Ok,
             Err(error) => {
                 print_error(&error.to_string());
-                if error.exit_code() == Exit::Usage.code() { Exit::Usage } else { Exit::Configuration }
+                error.exit()
             }
         }
     })
@@ -213,9 +214,9 @@ mod tests {
         assert_eq!(ids(3, 2).unwrap(), [3, 4]);
         assert_eq!(ids(1, 127).unwrap().len(), 127);
         let error = ids(100, 29).unwrap_err();
-        assert_eq!(error.exit_code(), 64);
+        assert_eq!(error.exit(), Exit::Usage);
         assert!(error.to_string().contains("up to 128"), "{error}");
-        assert_eq!(ids(127, 255).unwrap_err().exit_code(), 64);
+        assert_eq!(ids(127, 255).unwrap_err().exit(), Exit::Usage);
     }
 
     #[test]
@@ -228,9 +229,10 @@ mod tests {
         assert_eq!(with(path.to_str().unwrap()).unwrap().len(), 1);
         std::fs::write(&path, "descripion = \"a story\"\n").unwrap();
         let error = with(path.to_str().unwrap()).unwrap_err();
-        assert_eq!(error.exit_code(), 78);
+        assert_eq!(error.exit(), Exit::Configuration);
         assert!(error.to_string().contains("story.toml:1:1: error"), "{error}");
-        let error = with("unheard_of").unwrap_err().to_string();
-        assert!(error.contains("knock_cylinder_7"), "{error}");
+        let error = with("unheard_of").unwrap_err();
+        assert_eq!(error.exit(), Exit::Io);
+        assert!(error.to_string().contains("knock_cylinder_7"), "{error}");
     }
 }
