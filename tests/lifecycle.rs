@@ -1,7 +1,9 @@
 //! The program as a process: exit codes, start without the outside world, stop, demo.
 
+use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, Read};
 use std::net::{SocketAddr, TcpListener};
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
@@ -108,10 +110,64 @@ fn a_wrong_configuration_exits_with_78_and_says_where() {
 }
 
 #[test]
-fn a_missing_file_exits_with_74_and_names_it() {
-    let output = run(&["run", "-c", "/nowhere/cangate.toml"]);
-    assert_eq!(output.status.code(), Some(74));
-    assert!(String::from_utf8(output.stderr).unwrap().contains("/nowhere/cangate.toml"));
+fn a_file_that_cannot_be_read_exits_with_74_and_is_named_whatever_the_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let good = configuration(folder.path(), "can0", free_address(), free_address());
+    let good = good.to_str().unwrap();
+    let missing = "/nowhere/file";
+    for arguments in [
+        &["run", "-c", missing][..],
+        &["check", missing],
+        &["check", good, missing],
+        &["map", "-c", missing],
+        &["map", "diff", missing, missing],
+        &["replay", missing, "-c", good],
+        &["replay", missing, "-c", missing],
+        &["sim", "detcon", "-i", "virtual:x", "--node", "1", "--scenario", missing],
+    ] {
+        let output = run(arguments);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(74), "{arguments:?}: {said}");
+        assert!(said.contains(missing), "{arguments:?}: {said}");
+    }
+}
+
+#[test]
+fn a_file_whose_content_is_wrong_exits_with_78_whatever_the_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let good = configuration(folder.path(), "can0", free_address(), free_address());
+    let (good, wrong) = (good.to_str().unwrap(), folder.path().join("wrong"));
+    std::fs::write(&wrong, "this is nothing\n").unwrap();
+    let wrong = wrong.to_str().unwrap();
+    for arguments in [
+        &["run", "-c", wrong][..],
+        &["check", wrong],
+        &["map", "-c", wrong],
+        &["map", "diff", wrong, wrong],
+        &["replay", wrong, "-c", good],
+        &["sim", "detcon", "-i", "virtual:x", "--node", "1", "--scenario", wrong],
+    ] {
+        let output = run(arguments);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(78), "{arguments:?}: {said}");
+        assert!(!said.is_empty(), "{arguments:?}");
+    }
+}
+
+#[test]
+fn variables_that_are_no_text_are_a_message_where_they_are_ours_and_nothing_elsewhere() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = configuration(folder.path(), "can0", free_address(), free_address());
+    let file = file.to_str().unwrap();
+    let odd = OsStr::from_bytes(b"\xFF");
+    for arguments in [&["check", file][..], &["map", "-c", file]] {
+        let foreign = cangate().args(arguments).env("LESSOPEN", odd).output().unwrap();
+        assert_eq!(foreign.status.code(), Some(0), "{}", String::from_utf8_lossy(&foreign.stderr));
+        let ours = cangate().args(arguments).env("CANGATE__GATEWAY__NAME", odd).output().unwrap();
+        let said = String::from_utf8_lossy(&ours.stderr);
+        assert_eq!(ours.status.code(), Some(78), "{said}");
+        assert!(said.contains("environment variable CANGATE__GATEWAY__NAME: error"), "{said}");
+    }
 }
 
 #[test]
@@ -160,6 +216,28 @@ fn the_passive_role_and_only_it_opens_an_adapter_to_listen_only() {
         let commands: Vec<String> = commands.filter(|line| !line.is_empty()).take(2).collect();
         assert_eq!(commands, ["C", opening], "{role}");
     }
+}
+
+#[tokio::test]
+async fn health_exits_with_0_while_the_gateway_is_ready_and_with_1_when_it_is_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let (modbus, http) = (free_address(), free_address());
+    let file = configuration(folder.path(), "cgtest-none", modbus, http);
+    let file = file.to_str().unwrap();
+    let ask = |what: &[&str]| run(&[&["health"], what].concat());
+    assert_eq!(ask(&["-c", file]).status.code(), Some(1), "nobody listens yet");
+    let gateway = Running::start(cangate().args(["run", "-c", file]));
+    connect(modbus, 1).await;
+    until("the gateway is ready", async || (ask(&["-c", file]).status.code() == Some(0)).then_some(())).await;
+    assert_eq!(ask(&[&format!("http://{http}/livez")]).status.code(), Some(0));
+    let absent = ask(&[&format!("http://{http}/absent")]);
+    assert_eq!(absent.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&absent.stderr).contains("answers 404"));
+    assert_eq!(ask(&["ftp://x"]).status.code(), Some(64));
+    gateway.signal(Signal::SIGTERM);
+    let (code, said) = tokio::task::spawn_blocking(move || gateway.wait()).await.unwrap();
+    assert_eq!(code, Some(0), "{said}");
+    assert_eq!(ask(&["-c", file]).status.code(), Some(1), "it has gone");
 }
 
 #[tokio::test]
@@ -245,6 +323,19 @@ fn schemas_are_json_and_completions_are_not_empty() {
     for shell in ["bash", "zsh", "fish"] {
         assert!(run(&["completions", shell]).stdout.len() > 1_000, "{shell}");
     }
+}
+
+#[test]
+fn man_prints_the_page_of_the_program_or_writes_one_for_each_command() {
+    let page = String::from_utf8(run(&["man"]).stdout).unwrap();
+    assert!(page.contains(".TH cangate 1") && page.contains(".SH SYNOPSIS"), "{page}");
+    let folder = tempfile::tempdir().unwrap();
+    assert_eq!(run(&["man", "-o", folder.path().to_str().unwrap()]).status.code(), Some(0));
+    for name in ["cangate.1", "cangate-run.1", "cangate-map-diff.1"] {
+        let page = std::fs::read_to_string(folder.path().join(name)).unwrap();
+        assert!(page.contains(".SH NAME"), "{name}");
+    }
+    assert_eq!(run(&["man", "-o", "/nowhere"]).status.code(), Some(74));
 }
 
 #[test]

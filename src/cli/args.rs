@@ -6,8 +6,10 @@ use std::path::PathBuf;
 use clap::{Args, Parser, ValueEnum};
 use clap_complete::Shell;
 
+use super::health::Url;
 use super::schema::Schema;
 use crate::can::interface::Interface;
+use crate::config::DEFAULT_FILE;
 use crate::modbus::MapFormat;
 use crate::telemetry::{DEFAULT_FILTER, LogFormat};
 
@@ -47,13 +49,17 @@ pub enum Subcommand {
     Schema(SchemaArguments),
     /// Print the completion script of a shell.
     Completions(CompletionsArguments),
+    /// Print the manual page, or write one for each command.
+    Man(ManArguments),
+    /// Ask the gateway on this host whether it is ready; exit code 1 when it is not. For containers and watchdogs.
+    Health(HealthArguments),
 }
 
 /// `cangate run`
 #[derive(Args, Debug)]
 pub struct RunArguments {
     /// The configuration file.
-    #[arg(short, long, default_value = "/etc/cangate/cangate.toml", value_name = "FILE")]
+    #[arg(short, long, default_value = DEFAULT_FILE, value_name = "FILE")]
     pub config: PathBuf,
 }
 
@@ -90,7 +96,7 @@ pub struct MapArguments {
     #[command(subcommand)]
     pub command: Option<MapCommand>,
     /// The configuration file.
-    #[arg(short, long, default_value = "/etc/cangate/cangate.toml", value_name = "FILE")]
+    #[arg(short, long, default_value = DEFAULT_FILE, value_name = "FILE")]
     pub config: PathBuf,
     /// How the map is written.
     #[arg(long, value_enum, default_value_t)]
@@ -153,7 +159,7 @@ pub struct ReplayArguments {
     #[arg(long, value_name = "NAME")]
     pub bus: Option<String>,
     /// The configuration file.
-    #[arg(short, long, default_value = "/etc/cangate/cangate.toml", value_name = "FILE")]
+    #[arg(short, long, default_value = DEFAULT_FILE, value_name = "FILE")]
     pub config: PathBuf,
 }
 
@@ -171,4 +177,23 @@ pub struct CompletionsArguments {
     /// The shell.
     #[arg(value_enum)]
     pub shell: Shell,
+}
+
+/// `cangate man`
+#[derive(Args, Debug)]
+pub struct ManArguments {
+    /// Write a page for each command into this folder instead, as `cangate-run.1`.
+    #[arg(short, long, value_name = "FOLDER")]
+    pub output: Option<PathBuf>,
+}
+
+/// `cangate health`
+#[derive(Args, Debug)]
+pub struct HealthArguments {
+    /// What to ask. Without it: /readyz at the address that the configuration says under [http].
+    #[arg(value_name = "URL")]
+    pub url: Option<Url>,
+    /// The configuration file; where there is none, the address is the default one.
+    #[arg(short, long, default_value = DEFAULT_FILE, value_name = "FILE", conflicts_with = "url")]
+    pub config: PathBuf,
 }

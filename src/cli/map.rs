@@ -22,7 +22,7 @@ pub(super) fn run(arguments: &MapArguments) -> Exit {
 fn diff(old: &Path, new: &Path) -> Result<Exit, Exit> {
     let diff = map_text::diff(&read_file(old)?, &read_file(new)?).map_err(|error| {
         print_error(&format!("{error}: {}; write maps with `cangate map --format json`", error.source));
-        Exit::Usage
+        Exit::Configuration
     })?;
     for line in &diff.lines {
         if !print_line(line) {

@@ -1,12 +1,15 @@
 //! The command line: one file for each subcommand, thin. \[IO\]
 //!
-//! Exit codes: 0 ok, 1 a comparison found a difference, 64 usage, 70 our bug, 74 IO at start, 78 configuration.
+//! Exit codes: 0 ok, 1 a comparison found a difference or a gateway is not ready, 64 usage, 70 our bug, 74 a port or a
+//! file cannot be used at the start, 78 what a file says is wrong.
 
 mod args;
 pub mod check;
 mod completions;
 mod demo;
+mod health;
 mod load;
+mod man;
 mod map;
 mod output;
 mod replay;
@@ -14,6 +17,7 @@ mod run;
 pub mod schema;
 pub mod sim;
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -28,13 +32,15 @@ pub enum Exit {
     Ok,
     /// 1: a comparison found a difference.
     Different,
+    /// 1: the gateway that was asked is not ready.
+    NotReady,
     /// 64: the command line is wrong.
     Usage,
     /// 70: a bug of ours.
     Bug,
     /// 74: something outside could not be used at start: a port is taken, a file cannot be read.
     Io,
-    /// 78: the configuration is wrong.
+    /// 78: the content of a file is wrong: of a configuration, a mapping, a map, a recording, a scenario.
     Configuration,
 }
 
@@ -44,7 +50,7 @@ impl Exit {
     pub fn code(self) -> u8 {
         match self {
             Self::Ok => 0,
-            Self::Different => 1,
+            Self::Different | Self::NotReady => 1,
             Self::Usage => 64,
             Self::Bug => 70,
             Self::Io => 74,
@@ -69,7 +75,11 @@ pub fn main() -> ExitCode {
         print_error(&text);
         return ExitCode::from(Exit::Usage.code());
     }
-    let exit = match arguments.command {
+    ExitCode::from(guarded(|| dispatch(arguments.command)).code())
+}
+
+fn dispatch(command: Subcommand) -> Exit {
+    match command {
         Subcommand::Run(options) => run::run(&options),
         Subcommand::Demo(options) => demo::run(&options),
         Subcommand::Check(options) => check::run(&options),
@@ -78,8 +88,17 @@ pub fn main() -> ExitCode {
         Subcommand::Replay(options) => replay::run(&options),
         Subcommand::Schema(options) => schema::run(&options),
         Subcommand::Completions(options) => completions::run(&options),
-    };
-    ExitCode::from(exit.code())
+        Subcommand::Man(options) => man::run(&options),
+        Subcommand::Health(options) => health::run(&options),
+    }
+}
+
+/// A panic ends a command with [`Exit::Bug`]; the panic hook has told where it was.
+fn guarded(command: impl FnOnce() -> Exit) -> Exit {
+    catch_unwind(AssertUnwindSafe(command)).unwrap_or_else(|_| {
+        print_error("this is a bug in cangate; please report it with the lines above");
+        Exit::Bug
+    })
 }
 
 #[cfg(test)]
@@ -105,10 +124,18 @@ mod tests {
             &["replay", "bus.log"],
             &["schema", "config"],
             &["completions", "bash"],
+            &["man"],
+            &["health", "http://127.0.0.1:8080/readyz"],
         ] {
             let line = std::iter::once("cangate").chain(words.iter().copied());
             assert!(CommandLine::try_parse_from(line).is_ok(), "{words:?}");
         }
+    }
+
+    #[test]
+    fn a_panic_is_our_bug() {
+        assert_eq!(guarded(|| panic!("for the test")), Exit::Bug);
+        assert_eq!(guarded(|| Exit::Different), Exit::Different);
     }
 
     #[test]

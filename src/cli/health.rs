@@ -1,0 +1,212 @@
+//! `cangate health`: asks a gateway over HTTP whether it is ready. \[IO\]
+//!
+//! An image made FROM scratch has no shell and no HTTP client, so the program asks itself. One request of HTTP 1.0 needs
+//! no library.
+
+use std::io::{self, Read, Write};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpStream, ToSocketAddrs};
+use std::path::Path;
+use std::str::FromStr;
+use std::time::Duration;
+
+use super::args::HealthArguments;
+use super::output::{print_error, print_line};
+use super::{Exit, load};
+use crate::web::WebSettings;
+
+/// For the connection, and for each step of the answer.
+const PATIENCE: Duration = Duration::from_secs(3);
+/// An answer is not read beyond this many bytes.
+const LONGEST_ANSWER: u64 = 16 * 1024;
+/// What is asked when nothing else is.
+const READY: &str = "/readyz";
+
+/// `http://HOST[:PORT][/PATH]`; without a path `/readyz`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Url {
+    /// Host and port, as in `plant-a:8080` or `[::1]:80`.
+    authority: String,
+    /// Begins with `/`.
+    path: String,
+}
+
+/// A text that is no such URL.
+#[derive(Debug, thiserror::Error)]
+#[error("write http://HOST:PORT/PATH, for example http://127.0.0.1:8080/readyz; there is no TLS")]
+pub struct UrlError;
+
+impl FromStr for Url {
+    type Err = UrlError;
+
+    fn from_str(text: &str) -> Result<Self, UrlError> {
+        let rest = text.strip_prefix("http://").ok_or(UrlError)?;
+        let (authority, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+        let odd = |character: char| character.is_whitespace() || character.is_control();
+        if authority.is_empty() || authority.contains('@') || rest.contains(odd) {
+            return Err(UrlError);
+        }
+        let has_port =
+            authority.rsplit_once(':').is_some_and(|(host, _)| !host.contains(':') || host.ends_with(']'));
+        let authority = if has_port { authority.to_owned() } else { format!("{authority}:80") };
+        let path = if matches!(path, "" | "/") { READY } else { path };
+        Ok(Self { authority, path: path.to_owned() })
+    }
+}
+
+impl Url {
+    /// `/readyz` of a gateway that listens there; one that listens everywhere is asked on this host.
+    fn ready(listen: SocketAddr) -> Self {
+        let ip = match listen.ip() {
+            IpAddr::V4(ip) if ip.is_unspecified() => IpAddr::V4(Ipv4Addr::LOCALHOST),
+            IpAddr::V6(ip) if ip.is_unspecified() => IpAddr::V6(Ipv6Addr::LOCALHOST),
+            ip => ip,
+        };
+        Self { authority: SocketAddr::new(ip, listen.port()).to_string(), path: READY.to_owned() }
+    }
+}
+
+/// Asks, and says what came of it: 0 when the gateway is ready, 1 when not.
+pub(super) fn run(arguments: &HealthArguments) -> Exit {
+    let url = match &arguments.url {
+        Some(url) => Ok(url.clone()),
+        None => configured(&arguments.config),
+    };
+    let url = match url {
+        Ok(url) => url,
+        Err(exit) => return exit,
+    };
+    match ask(&url) {
+        Ok(answer) if answer.status == 200 => {
+            print_line("ready");
+            Exit::Ok
+        }
+        Ok(answer) => {
+            print_error(&format!(
+                "http://{}{} answers {}: {}",
+                url.authority, url.path, answer.status, answer.body
+            ));
+            Exit::NotReady
+        }
+        Err(error) => {
+            print_error(&format!("http://{}{} does not answer: {error}", url.authority, url.path));
+            Exit::NotReady
+        }
+    }
+}
+
+/// Where the gateway of a configuration listens; where there is no file, as in a demo, the default.
+fn configured(file: &Path) -> Result<Url, Exit> {
+    let http = if file.exists() { load::configuration(file)?.settings.http } else { WebSettings::default() };
+    Ok(Url::ready(http.listen))
+}
+
+/// Status and text of an answer.
+#[derive(Debug, PartialEq, Eq)]
+struct Answer {
+    status: u16,
+    body: String,
+}
+
+fn ask(url: &Url) -> io::Result<Answer> {
+    let mut failed = io::Error::from(io::ErrorKind::NotFound);
+    for address in url.authority.to_socket_addrs()? {
+        match TcpStream::connect_timeout(&address, PATIENCE) {
+            Ok(stream) => return converse(stream, url),
+            Err(error) => failed = error,
+        }
+    }
+    Err(failed)
+}
+
+fn converse(mut stream: TcpStream, url: &Url) -> io::Result<Answer> {
+    stream.set_read_timeout(Some(PATIENCE))?;
+    stream.set_write_timeout(Some(PATIENCE))?;
+    write!(stream, "GET {} HTTP/1.0\r\nHost: {}\r\nConnection: close\r\n\r\n", url.path, url.authority)?;
+    let mut answer = Vec::new();
+    stream.take(LONGEST_ANSWER).read_to_end(&mut answer)?;
+    read(&String::from_utf8_lossy(&answer)).ok_or_else(|| io::Error::other("this is not HTTP"))
+}
+
+fn read(text: &str) -> Option<Answer> {
+    let mut words = text.lines().next()?.split(' ');
+    words.next().filter(|version| version.starts_with("HTTP/1."))?;
+    let status = words.next()?.parse().ok()?;
+    // Whatever is there is for a terminal or a log: nothing in it may command them.
+    let body = text.split_once("\r\n\r\n").map_or("", |(_, body)| body);
+    let body = body.trim().chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    Some(Answer { status, body })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::TcpListener;
+
+    use super::*;
+
+    #[test]
+    fn a_url_needs_a_host_and_has_port_80_and_readyz_unless_it_says_more() {
+        let parsed = |text: &str| text.parse::<Url>().ok().map(|url| (url.authority, url.path));
+        let some = |authority: &str, path: &str| Some((authority.to_owned(), path.to_owned()));
+        assert_eq!(parsed("http://plant:8080/livez"), some("plant:8080", "/livez"));
+        assert_eq!(parsed("http://plant"), some("plant:80", "/readyz"));
+        assert_eq!(parsed("http://[::1]/"), some("[::1]:80", "/readyz"));
+        assert_eq!(parsed("http://[::1]:8080"), some("[::1]:8080", "/readyz"));
+        for wrong in [
+            "plant:8080",
+            "https://plant",
+            "http://",
+            "http:///readyz",
+            "http://a b",
+            "http://me@plant",
+            "http://a/\r\nx",
+        ] {
+            assert_eq!(parsed(wrong), None, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_gateway_that_listens_everywhere_is_asked_on_this_host() {
+        let asked = |listen: &str| Url::ready(listen.parse().unwrap()).authority;
+        assert_eq!(asked("0.0.0.0:8080"), "127.0.0.1:8080");
+        assert_eq!(asked("[::]:8080"), "[::1]:8080");
+        assert_eq!(asked("10.0.0.5:80"), "10.0.0.5:80");
+    }
+
+    /// What is made of one answer of a server.
+    fn after(answer: &'static [u8]) -> io::Result<Answer> {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let url = Url::ready(listener.local_addr().unwrap());
+        let server = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            let mut request = Vec::new();
+            while !request.ends_with(b"\r\n\r\n") {
+                let mut byte = [0];
+                stream.read_exact(&mut byte).unwrap();
+                request.extend(byte);
+            }
+            // The asker may have heard enough.
+            let _ = stream.write_all(answer);
+            String::from_utf8(request).unwrap()
+        });
+        let answer = ask(&url);
+        assert!(server.join().unwrap().starts_with("GET /readyz HTTP/1.0\r\n"));
+        answer
+    }
+
+    #[test]
+    fn the_status_decides_and_the_body_is_told_without_what_a_terminal_obeys() {
+        let answer =
+            after(b"HTTP/1.1 503 Service Unavailable\r\nX: y\r\n\r\n{\"ready\":\x1b[2Jfalse}\n").unwrap();
+        assert_eq!(answer, Answer { status: 503, body: "{\"ready\": [2Jfalse}".to_owned() });
+        assert_eq!(after(b"HTTP/1.0 200 OK\r\n\r\n").unwrap().status, 200);
+    }
+
+    #[test]
+    fn what_is_not_http_is_no_answer() {
+        for wrong in
+            [&b""[..], b"\xFF\xFF", b"SSH-2.0-x\r\n", b"HTTP/1.1 many\r\n\r\n", b"HTTP/1.1 99999 x\r\n\r\n"]
+        {
+            assert!(after(wrong).is_err(), "{wrong:?}");
+        }
+    }
+}
