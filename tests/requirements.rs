@@ -5,17 +5,33 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
-/// Names of all functions under a folder.
-fn function_names(folder: &Path, into: &mut BTreeSet<String>) {
+/// Names of the test functions of a source text: those with a test attribute, and without one that leaves them out.
+fn tests_of(text: &str) -> BTreeSet<String> {
+    let (mut is_test, mut is_left_out) = (false, false);
+    let mut names = BTreeSet::new();
+    for line in text.lines().map(str::trim_start).filter(|line| !line.starts_with("//")) {
+        is_test |= line.starts_with("#[test]") || line.starts_with("#[tokio::test");
+        is_left_out |= line.starts_with("#[ignore");
+        let function = ["fn ", "async fn "].iter().find_map(|word| line.strip_prefix(word));
+        if let Some(rest) = function {
+            let name: String = rest.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect();
+            if std::mem::take(&mut is_test) && !std::mem::take(&mut is_left_out) {
+                names.insert(name);
+            }
+        }
+    }
+    names
+}
+
+/// Names of all tests under a folder.
+fn test_names(folder: &Path, into: &mut BTreeSet<String>) {
     for entry in fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
         if path.is_dir() {
-            function_names(&path, into);
+            test_names(&path, into);
         } else if path.extension().is_some_and(|extension| extension == "rs") {
             let text = fs::read_to_string(&path).unwrap();
-            into.extend(text.split("fn ").skip(1).map(|rest| {
-                rest.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect::<String>()
-            }));
+            into.extend(tests_of(&text));
         }
     }
 }
@@ -43,6 +59,24 @@ fn cited(name: &str) -> BTreeSet<u32> {
 }
 
 #[test]
+fn only_tests_that_run_are_a_proof() {
+    let text = "
+        /// Says how fn one_is_done.
+        fn two_helper() {}
+        #[test]
+        #[should_panic]
+        fn three_proof() { let text = \"fn four_text\"; }
+        #[tokio::test(start_paused = true)]
+        async fn five_proof() {}
+        #[test]
+        #[ignore = \"slow\"]
+        fn six_left_out() {}
+        fn seven_helper() {}
+    ";
+    assert_eq!(tests_of(text), ["three_proof", "five_proof"].map(str::to_owned).into());
+}
+
+#[test]
 fn citations_are_read_from_names() {
     assert_eq!(cited("r_det_036_node_lost"), BTreeSet::from([36]));
     assert_eq!(cited("v_det_01_r_det_007_to_010_start"), BTreeSet::from([7, 8, 9, 10]));
@@ -56,7 +90,7 @@ fn every_requirement_is_proved_or_says_why_not() {
     let collect = |folders: &[&str]| {
         let mut names = BTreeSet::new();
         for folder in folders {
-            function_names(&root.join(folder), &mut names);
+            test_names(&root.join(folder), &mut names);
         }
         names.iter().flat_map(|name| cited(name)).collect::<BTreeSet<u32>>()
     };
