@@ -1,9 +1,10 @@
 //! The CAN bus from outside: can-utils, link state, who may use it.
 
 use std::process::Command;
+use std::sync::atomic::{AtomicU32, Ordering::SeqCst};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use super::process::{Process, run};
+use super::process::{Line, Process, run};
 use super::wait::{wait_for, wait_until};
 
 /// The interface of all tests.
@@ -45,6 +46,9 @@ pub fn cansend(frame: &str) {
     assert!(good, "cansend {BUS} {frame}: {stderr}");
 }
 
+/// Frames by which a capture finds its place; no participant of any test sends or knows them.
+const MARK: &str = "7EF#";
+
 /// Everything that is on the bus, as can-utils' candump sees it.
 pub struct Capture {
     candump: Process,
@@ -55,16 +59,17 @@ impl Capture {
     pub fn start() -> Self {
         // -L: log format; -D: stay when the interface goes down; -e is left out: error frames are no frames of a participant.
         let candump = Process::start("candump", Command::new("candump").args(["-L", "-D", BUS]));
-        // A frame that no participant of any test knows, sent until it is seen.
+        // Sent until it is seen.
         let capture = Self { candump };
         wait_until("candump to listen", || {
-            cansend("7EF#");
+            cansend(MARK);
             capture.candump.stdout_count() > 0
         });
         capture
     }
 
-    /// The frames so far with the kernel's time in seconds since 1970, without the frames of [`start`](Self::start).
+    /// The frames so far with the kernel's time in seconds since 1970, without those of [`start`](Self::start) and
+    /// [`mark`](Self::mark).
     pub fn timed(&self) -> Vec<(f64, String)> {
         let read = |text: &str| {
             let mut words = text.split(' ');
@@ -75,8 +80,24 @@ impl Capture {
             .stdout(0)
             .iter()
             .filter_map(|line| read(&line.text))
-            .filter(|(_, frame)| frame != "7EF#")
+            .filter(|(_, frame)| !frame.starts_with(MARK))
             .collect()
+    }
+
+    /// How many frames were on the bus until now. A count of what candump has printed is late: a frame of a process that
+    /// has ended may not be in it yet. So a frame is sent, and those before it are counted.
+    pub fn mark(&self) -> usize {
+        static MARKS: AtomicU32 = AtomicU32::new(1);
+        let mark = format!("{MARK}{:08X}", MARKS.fetch_add(1, SeqCst));
+        cansend(&mark);
+        let is = |line: &Line, frame: &str| {
+            line.text.split(' ').nth(2).is_some_and(|seen| seen.starts_with(frame))
+        };
+        wait_for(format!("{mark} on {BUS}"), || {
+            let lines = self.candump.stdout(0);
+            let place = lines.iter().position(|line| is(line, &mark))?;
+            Some(lines[..place].iter().filter(|line| !is(line, MARK)).count())
+        })
     }
 
     /// The frames so far, for example `701#R1`.

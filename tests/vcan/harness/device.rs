@@ -22,6 +22,8 @@ struct Behaviour {
     obeys: AtomicBool,
     replies: AtomicU32,
     stop: AtomicBool,
+    /// Held while a request is dealt with, and while several things change that must hold for the next one.
+    turn: Mutex<()>,
     tpdos: Mutex<Option<[Vec<u8>; 4]>>,
     requests: Mutex<Vec<Instant>>,
 }
@@ -48,6 +50,7 @@ impl Device {
             obeys: AtomicBool::new(true),
             replies: AtomicU32::new(0),
             stop: AtomicBool::new(false),
+            turn: Mutex::new(()),
             tpdos: Mutex::new(None),
             requests: Mutex::new(Vec::new()),
         });
@@ -88,6 +91,14 @@ impl Device {
     /// Whether the toggle bit changes.
     pub fn toggle(&self, toggle: bool) {
         self.behaviour.toggles.store(toggle, SeqCst);
+    }
+
+    /// Answers from the next request on, that one with this toggle bit, alternating after it.
+    pub fn answer_from(&self, toggle: bool) {
+        let _turn = self.behaviour.turn.lock().unwrap();
+        self.behaviour.toggle.store(toggle, SeqCst);
+        self.behaviour.toggles.store(true, SeqCst);
+        self.behaviour.answers.store(true, SeqCst);
     }
 
     /// Whether NMT commands have an effect.
@@ -153,6 +164,7 @@ fn receive(device: &Behaviour, socket: &CanSocket, frame: &CanFrame) {
     let error_control = 0x700 + u32::from(device.node);
     match frame {
         CanFrame::Remote(request) if request.raw_id() & 0x1FFF_FFFF == error_control => {
+            let _turn = device.turn.lock().unwrap();
             device.requests.lock().unwrap().push(Instant::now());
             let toggle = device.toggle.load(SeqCst);
             if device.toggles.load(SeqCst) {
