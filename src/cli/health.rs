@@ -57,9 +57,9 @@ impl Url {
     /// `/readyz` of a gateway that listens there; one that listens everywhere is asked on this host.
     fn ready(listen: SocketAddr) -> Self {
         let ip = match listen.ip() {
-            IpAddr::V4(ip) if ip.is_unspecified() => IpAddr::V4(Ipv4Addr::LOCALHOST),
-            IpAddr::V6(ip) if ip.is_unspecified() => IpAddr::V6(Ipv6Addr::LOCALHOST),
-            ip => ip,
+            ip if !ip.is_unspecified() => ip,
+            IpAddr::V4(_) => IpAddr::V4(Ipv4Addr::LOCALHOST),
+            IpAddr::V6(_) => IpAddr::V6(Ipv6Addr::LOCALHOST),
         };
         Self { authority: SocketAddr::new(ip, listen.port()).to_string(), path: READY.to_owned() }
     }

@@ -88,7 +88,7 @@ mod tests {
 
     #[test]
     fn a_thread_that_is_held_up_does_not_hold_up_the_end() {
-        let (release, held) = mpsc::channel::<()>();
+        let (release, held) = mpsc::sync_channel::<()>(1);
         let over = Arc::new(AtomicBool::new(false));
         let told = Arc::clone(&over);
         let exit = block_on(async move {
