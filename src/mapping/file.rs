@@ -161,49 +161,109 @@ pub struct ParameterSection {
     pub unit: String,
 }
 
-/// `[[tag]]`.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct TagSection {
-    /// Its name, unique, snake case. With `array` it holds `{}`.
-    pub name: At<String>,
+/// An entry that makes tags: keys of its own among those that all such entries share.
+///
+/// The shared ones stand here once, and no reader of TOML is between them and the file: a `flatten` would lose the
+/// places of the values and the unknown keys. `decimals` has a text for each kind of entry, as its default differs.
+macro_rules! tag_entry {
+    (
+        $(#[$about:meta])*
+        pub struct $name:ident { $($own:tt)* }
+        $(#[$decimals:meta])*
+        decimals
+    ) => {
+        $(#[$about])*
+        #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+        #[serde(deny_unknown_fields)]
+        pub struct $name {
+            /// Its name, unique, snake case. With `array` it holds `{}`.
+            pub name: At<String>,
+            /// One sentence.
+            #[serde(default)]
+            pub description: String,
+            $($own)*
+            /// Engineering unit.
+            #[serde(default)]
+            pub unit: String,
+            $(#[$decimals])*
+            pub decimals: Option<At<u64>>,
+            /// A smaller change is not published by itself; in engineering units. Default: 0.
+            pub deadband: Option<At<f64>>,
+            /// A bool tag that tells whether the value means anything.
+            pub valid: Option<At<String>>,
+            /// Part of the MQTT state message. Default: true.
+            pub publish: Option<bool>,
+            /// Where it stands in the register map.
+            #[serde(default)]
+            pub registers: Vec<RegisterSection>,
+            /// Address among the discrete inputs and coils; bool tags only.
+            pub bit_address: Option<At<u64>>,
+            /// Makes several tags of one entry.
+            pub array: Option<At<ArraySection>>,
+        }
+
+        impl $name {
+            /// The keys that it shares with other entries that make tags.
+            #[must_use]
+            pub fn shared(&self) -> SharedKeys<'_> {
+                SharedKeys {
+                    description: &self.description,
+                    unit: &self.unit,
+                    decimals: self.decimals.as_ref(),
+                    deadband: self.deadband.as_ref(),
+                    valid: self.valid.as_ref(),
+                    publish: self.publish,
+                    registers: &self.registers,
+                    bit_address: self.bit_address.as_ref(),
+                }
+            }
+        }
+    };
+}
+
+/// What all entries that make tags say of them, whatever their values come from; name and array apart.
+#[derive(Clone, Copy, Debug)]
+pub struct SharedKeys<'a> {
     /// One sentence.
-    #[serde(default)]
-    pub description: String,
-    /// Number of the TPDO that carries it.
-    pub tpdo: At<u64>,
-    /// Place of its lowest bit: byte b bit i = 8 b + i.
-    pub bit: At<u64>,
-    /// `bool`, `u1`..`u64`, `i2`..`i64`, `f32` or `f64`.
-    #[serde(rename = "type")]
-    #[schemars(regex(pattern = r"^(bool|f32|f64|[ui]([1-9]|[1-5][0-9]|6[0-4]))$"))]
-    pub kind: At<String>,
-    /// Order of its bytes; `big` needs whole bytes. Default: little.
-    #[serde(default)]
-    pub byte_order: ByteOrderWord,
-    /// Invert all its bits. Default: false.
-    #[serde(default)]
-    pub invert: bool,
-    /// From the raw number to engineering units. Default: as it is.
-    pub scale: Option<At<ScaleSection>>,
+    pub description: &'a str,
     /// Engineering unit.
-    #[serde(default)]
-    pub unit: String,
-    /// Digits after the decimal point, 0..=12. Default: 2 where it is scaled or a float, else 0.
-    pub decimals: Option<At<u64>>,
-    /// A smaller change is not published by itself; in engineering units. Default: 0.
-    pub deadband: Option<At<f64>>,
+    pub unit: &'a str,
+    /// Digits after the decimal point.
+    pub decimals: Option<&'a At<u64>>,
+    /// A smaller change is not published by itself; in engineering units.
+    pub deadband: Option<&'a At<f64>>,
     /// A bool tag that tells whether the value means anything.
-    pub valid: Option<At<String>>,
-    /// Part of the MQTT state message. Default: true.
+    pub valid: Option<&'a At<String>>,
+    /// Part of the MQTT state message.
     pub publish: Option<bool>,
     /// Where it stands in the register map.
-    #[serde(default)]
-    pub registers: Vec<RegisterSection>,
-    /// Address among the discrete inputs and coils; bool tags only.
-    pub bit_address: Option<At<u64>>,
-    /// Makes several tags of one entry.
-    pub array: Option<At<ArraySection>>,
+    pub registers: &'a [RegisterSection],
+    /// Address among the discrete inputs and coils.
+    pub bit_address: Option<&'a At<u64>>,
+}
+
+tag_entry! {
+    /// `[[tag]]`.
+    pub struct TagSection {
+        /// Number of the TPDO that carries it.
+        pub tpdo: At<u64>,
+        /// Place of its lowest bit: byte b bit i = 8 b + i.
+        pub bit: At<u64>,
+        /// `bool`, `u1`..`u64`, `i2`..`i64`, `f32` or `f64`.
+        #[serde(rename = "type")]
+        #[schemars(regex(pattern = r"^(bool|f32|f64|[ui]([1-9]|[1-5][0-9]|6[0-4]))$"))]
+        pub kind: At<String>,
+        /// Order of its bytes; `big` needs whole bytes. Default: little.
+        #[serde(default)]
+        pub byte_order: ByteOrderWord,
+        /// Invert all its bits. Default: false.
+        #[serde(default)]
+        pub invert: bool,
+        /// From the raw number to engineering units. Default: as it is.
+        pub scale: Option<At<ScaleSection>>,
+    }
+    /// Digits after the decimal point, 0..=12. Default: 2 where it is scaled or a float, else 0.
+    decimals
 }
 
 /// `value = raw * multiply / divide + add`.
@@ -265,58 +325,37 @@ pub struct ArraySection {
     pub bit_stride: Option<At<u64>>,
 }
 
-/// `[[derived]]`: a name and exactly one of the ways to compute it.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct DerivedSection {
-    /// Its name, unique, snake case. With `array` it holds `{}`.
-    pub name: At<String>,
-    /// One sentence.
-    #[serde(default)]
-    pub description: String,
-    /// One bit of an unsigned tag; in an array each takes the next bit.
-    pub bit: Option<BitSection>,
-    /// Bool tags as the bits of a number, the first lowest.
-    pub pack: Option<At<NameList>>,
-    /// A condition.
-    pub when: Option<At<String>>,
-    /// The highest of several values.
-    pub maximum: Option<At<NameList>>,
-    /// The number of the highest of several values.
-    pub arg_maximum: Option<At<NameList>>,
-    /// The smallest distance of several values up to a limit; negative above it.
-    pub margin: Option<MarginSection>,
-    /// How many bool tags are true.
-    pub count: Option<At<NameList>>,
-    /// Rising edges of a bool tag since the start, modulo 65536.
-    pub rising_edges: Option<At<String>>,
-    /// Seconds since the last rising edge of a bool tag; 65535 = never.
-    pub seconds_since_rise: Option<At<String>>,
-    /// A bool tag that stays true until the node's alarms are acknowledged.
-    pub latch: Option<At<String>>,
-    /// Rising edges of a bool tag within the last seconds.
-    pub edges_within: Option<EdgesSection>,
-    /// For `maximum`, `arg_maximum` and `margin`: a bool tag for each value that tells whether it takes part.
-    #[serde(rename = "where")]
-    pub only_where: Option<At<NameList>>,
-    /// Engineering unit.
-    #[serde(default)]
-    pub unit: String,
+tag_entry! {
+    /// `[[derived]]`: a name and exactly one of the ways to compute it.
+    pub struct DerivedSection {
+        /// One bit of an unsigned tag; in an array each takes the next bit.
+        pub bit: Option<BitSection>,
+        /// Bool tags as the bits of a number, the first lowest.
+        pub pack: Option<At<NameList>>,
+        /// A condition.
+        pub when: Option<At<String>>,
+        /// The highest of several values.
+        pub maximum: Option<At<NameList>>,
+        /// The number of the highest of several values.
+        pub arg_maximum: Option<At<NameList>>,
+        /// The smallest distance of several values up to a limit; negative above it.
+        pub margin: Option<MarginSection>,
+        /// How many bool tags are true.
+        pub count: Option<At<NameList>>,
+        /// Rising edges of a bool tag since the start, modulo 65536.
+        pub rising_edges: Option<At<String>>,
+        /// Seconds since the last rising edge of a bool tag; 65535 = never.
+        pub seconds_since_rise: Option<At<String>>,
+        /// A bool tag that stays true until the node's alarms are acknowledged.
+        pub latch: Option<At<String>>,
+        /// Rising edges of a bool tag within the last seconds.
+        pub edges_within: Option<EdgesSection>,
+        /// For `maximum`, `arg_maximum` and `margin`: a bool tag for each value that tells whether it takes part.
+        #[serde(rename = "where")]
+        pub only_where: Option<At<NameList>>,
+    }
     /// Digits after the decimal point, 0..=12. Default: 2 for `maximum` and `margin`, else 0.
-    pub decimals: Option<At<u64>>,
-    /// A smaller change is not published by itself; in engineering units. Default: 0.
-    pub deadband: Option<At<f64>>,
-    /// A bool tag that tells whether the value means anything.
-    pub valid: Option<At<String>>,
-    /// Part of the MQTT state message. Default: true.
-    pub publish: Option<bool>,
-    /// Where it stands in the register map.
-    #[serde(default)]
-    pub registers: Vec<RegisterSection>,
-    /// Address among the discrete inputs and coils; bool tags only.
-    pub bit_address: Option<At<u64>>,
-    /// Makes several tags of one entry.
-    pub array: Option<At<ArraySection>>,
+    decimals
 }
 
 /// One bit of an unsigned tag.

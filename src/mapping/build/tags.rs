@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 use super::super::file::{
-    DerivedSection, EncodingWord, MappingFile, ParameterSection, RegisterSection, ScaleSection, TagSection,
+    DerivedSection, EncodingWord, MappingFile, ParameterSection, RegisterSection, ScaleSection, SharedKeys,
+    TagSection,
 };
 use super::super::installation::{ByteOrderWord, NodeEntry, TagEntry};
 use super::super::table::{Derived, Encoding, FieldKind, RegisterDef, Scale, Source, Space, TagDef};
@@ -34,6 +35,15 @@ pub enum Kind {
     Number,
 }
 
+/// The kind of the tags of an entry.
+fn kind(entry: Entry<'_>) -> Kind {
+    match entry {
+        Entry::Parameter(_) => Kind::Number,
+        Entry::Tag(section) => fields::kind(section),
+        Entry::Derived(section) => derived::kind(section),
+    }
+}
+
 /// What the parts of the work on one node share.
 pub struct Context<'a> {
     /// The mapping file.
@@ -57,11 +67,7 @@ pub struct Context<'a> {
 impl Context<'_> {
     /// The kind of a tag.
     pub fn kind(&self, index: usize) -> Kind {
-        match self.items.get(index).map(|item| item.entry) {
-            Some(Entry::Tag(tag)) => fields::kind(tag),
-            Some(Entry::Derived(section)) => derived::kind(section),
-            Some(Entry::Parameter(_)) | None => Kind::Number,
-        }
+        self.items.get(index).map_or(Kind::Number, |item| kind(item.entry))
     }
 
     /// A bool tag, by its name.
@@ -184,18 +190,8 @@ fn from_pdo(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, sec
         }
     }
     let scaled = scale != Scale::IDENTITY || field.kind == FieldKind::Float;
-    let common = Common {
-        description: &section.description,
-        unit: &section.unit,
-        decimals: section.decimals.as_ref(),
-        usual_decimals: if scaled { 2 } else { 0 },
-        deadband: section.deadband.as_ref(),
-        valid: section.valid.as_ref(),
-        publish: section.publish,
-        registers: &section.registers,
-        bit_address: section.bit_address.as_ref(),
-    };
-    common.tag(problems, context, item, Source::Pdo { pdo, field, scale })
+    let usual_decimals = if scaled { 2 } else { 0 };
+    finished(problems, context, item, section.shared(), usual_decimals, Source::Pdo { pdo, field, scale })
 }
 
 fn scale(problems: &mut Problems, context: &Context<'_>, section: Option<&At<ScaleSection>>) -> Scale {
@@ -227,98 +223,73 @@ fn computed(
     }
     let derived = derived::derived(problems, context, item, section);
     let fraction = section.maximum.is_some() || section.margin.is_some();
-    let common = Common {
-        description: &section.description,
-        unit: &section.unit,
-        decimals: section.decimals.as_ref(),
-        usual_decimals: if fraction { 2 } else { 0 },
-        deadband: section.deadband.as_ref(),
-        valid: section.valid.as_ref(),
-        publish: section.publish,
-        registers: &section.registers,
-        bit_address: section.bit_address.as_ref(),
-    };
-    common.tag(problems, context, item, Source::Derived(derived))
+    let usual_decimals = if fraction { 2 } else { 0 };
+    finished(problems, context, item, section.shared(), usual_decimals, Source::Derived(derived))
 }
 
-/// The keys that tags and derived tags share.
-struct Common<'a> {
-    description: &'a str,
-    unit: &'a str,
-    decimals: Option<&'a At<u64>>,
+/// A tag with all that entries share, whatever its source is.
+fn finished(
+    problems: &mut Problems,
+    context: &Context<'_>,
+    item: &Item<'_>,
+    keys: SharedKeys<'_>,
     usual_decimals: u8,
-    deadband: Option<&'a At<f64>>,
-    valid: Option<&'a At<String>>,
-    publish: Option<bool>,
-    registers: &'a [RegisterSection],
-    bit_address: Option<&'a At<u64>>,
-}
-
-impl Common<'_> {
-    fn tag(&self, problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, source: Source) -> TagDef {
-        let mut description = item.element.fill(self.description);
-        let mut deadband = self.deadband.map(|value| (context.source, value));
-        for (_, entry) in overrides(context, &item.name) {
-            deadband = entry.deadband.as_ref().map(|value| (context.config, value)).or(deadband);
-            description = entry.description.clone().unwrap_or(description);
-        }
-        if let Some((source, value)) = deadband
-            && !(value.value.is_finite() && value.value >= 0.0)
-        {
-            problems.error(source, &value.span, "a deadband is a number, not negative", "use 0 for none");
-        }
-        let decimals =
-            self.decimals.map(|decimals| problems.within(context.source, decimals, "decimals", 0..=12));
-        TagDef {
-            node: context.node,
-            name: item.name.clone(),
-            description,
-            unit: item.element.fill(self.unit),
-            decimals: decimals
-                .and_then(|decimals| u8::try_from(decimals).ok())
-                .unwrap_or(self.usual_decimals),
-            source,
-            valid: self.valid.and_then(|valid| context.bool_tag(problems, valid, &item.element, "`valid`")),
-            registers: self.places(problems, context, item),
-            published: self.publish.unwrap_or(true),
-            deadband: deadband.map_or(0.0, |(_, value)| value.value),
-        }
+    source: Source,
+) -> TagDef {
+    let mut description = item.element.fill(keys.description);
+    let mut deadband = keys.deadband.map(|value| (context.source, value));
+    for (_, entry) in overrides(context, &item.name) {
+        deadband = entry.deadband.as_ref().map(|value| (context.config, value)).or(deadband);
+        description = entry.description.clone().unwrap_or(description);
     }
-
-    fn places(&self, problems: &mut Problems, context: &Context<'_>, item: &Item<'_>) -> Vec<RegisterDef> {
-        let kind = item_kind(item);
-        let mut places: Vec<RegisterDef> = self
-            .registers
-            .iter()
-            .filter_map(|register| place(problems, context, item, register, kind))
-            .collect();
-        let Some(bit) = self.bit_address else { return places };
-        if kind != Kind::Bool {
-            let hint = "give it `registers`, or make a derived tag with `when`";
-            let message = format!("`{}` is a number and cannot stand among the discrete inputs", item.name);
-            problems.error(context.source, &bit.span, message, hint);
-        }
-        let address = bit.value.saturating_add(item.element.index);
-        if ALARM_BITS.contains(&address) {
-            let hint = "bits 128 to 191 show the node's alarms; use another address";
-            problems.error(context.source, &bit.span, format!("bit address {address} is taken"), hint);
-        }
-        places.extend(address_of(problems, context, bit, item, 1).map(|address| RegisterDef {
-            space: Space::Bit,
-            address,
-            encoding: Encoding::Bool,
-            resolution: 1.0,
-        }));
-        places
+    if let Some((source, value)) = deadband
+        && !(value.value.is_finite() && value.value >= 0.0)
+    {
+        problems.error(source, &value.span, "a deadband is a number, not negative", "use 0 for none");
+    }
+    let decimals =
+        keys.decimals.map(|decimals| problems.within(context.source, decimals, "decimals", 0..=12));
+    TagDef {
+        node: context.node,
+        name: item.name.clone(),
+        description,
+        unit: item.element.fill(keys.unit),
+        decimals: decimals.and_then(|decimals| u8::try_from(decimals).ok()).unwrap_or(usual_decimals),
+        source,
+        valid: keys.valid.and_then(|valid| context.bool_tag(problems, valid, &item.element, "`valid`")),
+        registers: places(problems, context, item, keys),
+        published: keys.publish.unwrap_or(true),
+        deadband: deadband.map_or(0.0, |(_, value)| value.value),
     }
 }
 
-fn item_kind(item: &Item<'_>) -> Kind {
-    match item.entry {
-        Entry::Parameter(_) => Kind::Number,
-        Entry::Tag(section) => fields::kind(section),
-        Entry::Derived(section) => derived::kind(section),
+fn places(
+    problems: &mut Problems,
+    context: &Context<'_>,
+    item: &Item<'_>,
+    keys: SharedKeys<'_>,
+) -> Vec<RegisterDef> {
+    let kind = kind(item.entry);
+    let mut places: Vec<RegisterDef> =
+        keys.registers.iter().filter_map(|register| place(problems, context, item, register, kind)).collect();
+    let Some(bit) = keys.bit_address else { return places };
+    if kind != Kind::Bool {
+        let hint = "give it `registers`, or make a derived tag with `when`";
+        let message = format!("`{}` is a number and cannot stand among the discrete inputs", item.name);
+        problems.error(context.source, &bit.span, message, hint);
     }
+    let address = bit.value.saturating_add(item.element.index);
+    if ALARM_BITS.contains(&address) {
+        let hint = "bits 128 to 191 show the node's alarms; use another address";
+        problems.error(context.source, &bit.span, format!("bit address {address} is taken"), hint);
+    }
+    places.extend(address_of(problems, context, bit, item, 1).map(|address| RegisterDef {
+        space: Space::Bit,
+        address,
+        encoding: Encoding::Bool,
+        resolution: 1.0,
+    }));
+    places
 }
 
 fn place(
