@@ -8,7 +8,7 @@ use super::conditions::Conditions;
 use super::events::{EventLog, Name};
 use super::marks::Marks;
 use super::node::Node;
-use super::tags::Tags;
+use super::tags::{CarrierIndex, Tags};
 use super::{Command, Outcome};
 use crate::can::{BusEvent, BusIndex, CanFrame};
 use crate::canopen::{PdoIndex, Role};
@@ -70,6 +70,8 @@ pub struct Gateway {
     pub(super) conditions: Conditions,
     pub(super) events: EventLog,
     pub(super) health: Health,
+    /// Nodes of which a tag changed, while one input is worked off.
+    changed_nodes: Marks,
     pub(super) dirty_nodes: Marks,
     pub(super) dirty_buses: Marks,
     /// Taken after each input, so that it holds what one input causes and no more.
@@ -93,6 +95,7 @@ impl Gateway {
             conditions: Conditions::new(&table),
             events: EventLog::new(Arc::clone(&table)),
             health: Health::default(),
+            changed_nodes: Marks::new(nodes.len()),
             dirty_nodes: Marks::new(nodes.len()),
             dirty_buses: Marks::new(table.buses.len()),
             outputs: VecDeque::new(),
@@ -101,6 +104,9 @@ impl Gateway {
             nodes,
             table,
         };
+        for (place, node) in gateway.nodes.iter_mut().enumerate() {
+            node.status.data_good = gateway.tags.all_good(NodeIndex(place));
+        }
         gateway.events.record(now, AlarmOwner::Gateway, Name::Word("gateway_started"), |_| ());
         for bus in 0..gateway.buses.len() {
             gateway.drain_network(now, BusIndex(bus));
@@ -269,14 +275,15 @@ impl Gateway {
 
     /// The tags of a node, or of one of its TPDOs, can be trusted less.
     pub(super) fn degrade(&mut self, now: Now, node: NodeIndex, pdo: Option<PdoIndex>, quality: Quality) {
-        let changed = self.tags.degrade(&self.table, now, node, pdo, quality);
+        let carrier = pdo.map(CarrierIndex::from);
+        let changed = self.tags.degrade(&self.table, now, node, carrier, quality);
         self.dirty_nodes.mark(node.0);
         let Some(node) = self.nodes.get_mut(node.0) else { return };
         if changed {
             node.status.generation = node.status.generation.wrapping_add(1);
         }
         if !quality.is_usable() {
-            node.forget_freshness(pdo);
+            node.lose_data_of(pdo);
         }
     }
 
@@ -291,6 +298,15 @@ impl Gateway {
         }
         for tag in self.tags.drain_changed() {
             self.conditions.tag_changed(tag);
+            if let Some(def) = self.table.tag(tag) {
+                self.changed_nodes.mark(def.node.0);
+            }
+        }
+        for place in self.changed_nodes.drain() {
+            if let Some(node) = self.nodes.get_mut(place) {
+                node.status.data_good = self.tags.all_good(NodeIndex(place));
+            }
+            self.dirty_nodes.mark(place);
         }
         self.conditions.evaluate(now, &self.table, self.tags.samples());
         while let Some(transition) = self.conditions.poll_transition() {

@@ -8,7 +8,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use crate::mapping::Derived;
+use crate::mapping::{Derived, codec};
 use crate::process_image::{Quality, Reason, Sample, TagIndex, Value};
 use crate::time::{Instant, Now};
 
@@ -103,30 +103,6 @@ pub(super) fn runs_with_time(derived: &Derived, memory: &Memory, now: Now) -> bo
     }
 }
 
-/// The tags that a derived tag looks at.
-pub(super) fn inputs(derived: &Derived) -> Vec<TagIndex> {
-    match derived {
-        Derived::Bit { of, .. }
-        | Derived::RisingEdges { of }
-        | Derived::SecondsSinceRise { of }
-        | Derived::Latch { of }
-        | Derived::EdgesWithin { of, .. } => vec![*of],
-        Derived::Pack { of } | Derived::Count { of } => of.clone(),
-        Derived::Logic { when } => {
-            let mut tags = Vec::new();
-            when.for_each_tag(&mut |tag| tags.push(tag));
-            tags
-        }
-        Derived::Maximum { among, valid } | Derived::ArgMaximum { among, valid, .. } => {
-            among.iter().chain(valid.iter().flatten()).copied().collect()
-        }
-        Derived::Margin { among, valid, limit } => {
-            among.iter().chain(valid.iter().flatten()).chain([limit]).copied().collect()
-        }
-        Derived::Constant { .. } => Vec::new(),
-    }
-}
-
 /// The value of a derived tag now. For [`Derived::RisingEdges`] also the edge of its source, where there was one.
 pub(super) fn evaluate(
     now: Now,
@@ -137,7 +113,7 @@ pub(super) fn evaluate(
     let computed = match derived {
         Derived::Bit { of, bit } => {
             let source = sample(tags, *of);
-            let set = unsigned(source.raw).checked_shr(u32::from(*bit)).unwrap_or(0) & 1 == 1;
+            let set = codec::raw_bits(source.raw).checked_shr(u32::from(*bit)).unwrap_or(0) & 1 == 1;
             Computed::plain(Value::Bool(set), source.quality)
         }
         Derived::Pack { of } => pack(tags, of),
@@ -198,16 +174,6 @@ pub(super) fn evaluate(
 
 fn sample(tags: &[Sample], tag: TagIndex) -> &Sample {
     tags.get(tag.0).unwrap_or(&Sample::NEVER)
-}
-
-/// The bits of a raw value.
-fn unsigned(value: Value) -> u64 {
-    match value {
-        Value::Bool(bit) => u64::from(bit),
-        Value::Unsigned(number) => number,
-        Value::Signed(number) => number.cast_unsigned(),
-        Value::Float(number) => number.to_bits(),
-    }
 }
 
 fn place_number(first: u16, place: usize) -> u64 {

@@ -106,11 +106,11 @@ impl Node {
     }
 
     /// The data of a TPDO, or of all, is not usable any more and need not be watched.
-    pub(super) fn forget_freshness(&mut self, pdo: Option<PdoIndex>) {
-        for (place, fresh_until) in self.fresh_until.iter_mut().enumerate() {
-            if pdo.is_none_or(|pdo| pdo.0 == place) {
-                *fresh_until = None;
-            }
+    pub(super) fn lose_data_of(&mut self, pdo: Option<PdoIndex>) {
+        let pdos = self.fresh_until.iter_mut().zip(&mut self.status.pdos).enumerate();
+        for (_, (fresh_until, status)) in pdos.filter(|(place, _)| pdo.is_none_or(|pdo| pdo.0 == *place)) {
+            *fresh_until = None;
+            status.usable = false;
         }
     }
 

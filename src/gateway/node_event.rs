@@ -100,6 +100,7 @@ impl Gateway {
         status.received = status.received.saturating_add(1);
         let was_stale = std::mem::take(&mut status.stale);
         let number = status.number;
+        status.usable = true;
         node.status.newest_data = Some(now.utc);
         let quality = node.quality_of_new_data();
         let fresh_until =
@@ -114,7 +115,7 @@ impl Gateway {
         let reserved = def.reserved_bits.get(pdo.0).copied().unwrap_or(0) & u64::from_le_bytes(data);
         let before = node.reserved.get_mut(pdo.0).map(|before| std::mem::replace(before, reserved));
         let used = data.get(..usize::from(length)).unwrap_or(&data);
-        if self.tags.apply_pdo(&self.table, now, (index, pdo), used, quality) {
+        if self.tags.apply(&self.table, now, (index, pdo.into()), used, quality) {
             node.status.generation = node.status.generation.wrapping_add(1);
         }
         self.dirty_nodes.mark(index.0);

@@ -1,10 +1,15 @@
 //! The current value of every tag: decoding, qualities, and which derived tags have to be computed again.
 //!
-//! Nothing here allocates once it is made. What depends on what is worked out at the start; after that a TPDO
-//! touches its own tags and those that are computed from them, and no others.
+//! Nothing here allocates once it is made. What depends on what is worked out at the start; after that new data
+//! touches the tags that stand in it and those that are computed from them, and no others.
+//!
+//! What carries values from a device is called a carrier here. Where in it each tag stands is taken over from the
+//! table at the start, so that nothing that is done with received data looks at the source of a tag.
+
+use std::collections::BTreeSet;
 
 use crate::canopen::PdoIndex;
-use crate::mapping::{FieldKind, Scale, Source, TagTable, codec};
+use crate::mapping::{Derived, Field, FieldKind, NodeDef, Scale, Source, TagTable, codec};
 use crate::process_image::{NodeIndex, ProcessImage, Quality, Reason, Revision, Sample, TagIndex, Value};
 use crate::time::{Instant, Now};
 
@@ -26,20 +31,39 @@ struct Layout {
     dependents: Vec<Vec<TagIndex>>,
 }
 
+/// Which carrier of a node: its TPDOs, by their places in its settings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct CarrierIndex(pub(super) usize);
+
+impl From<PdoIndex> for CarrierIndex {
+    fn from(pdo: PdoIndex) -> Self {
+        Self(pdo.0)
+    }
+}
+
 #[derive(Debug)]
 struct NodeLayout {
-    /// By TPDO.
-    pdos: Vec<PdoLayout>,
+    /// By [`CarrierIndex`].
+    carriers: Vec<CarrierLayout>,
     /// In the order of the table: inputs come before what is computed from them.
     derived: Vec<TagIndex>,
 }
 
 #[derive(Debug, Default)]
-struct PdoLayout {
+struct CarrierLayout {
     /// Tags that stand in it.
-    tags: Vec<TagIndex>,
-    /// Tags that are computed from those, however indirectly.
+    placed: Vec<Placed>,
+    /// Tags that are computed from those, however indirectly, in the order of the table.
     computed: Vec<TagIndex>,
+}
+
+/// A tag and its place in a carrier.
+#[derive(Debug)]
+struct Placed {
+    tag: TagIndex,
+    field: Field,
+    /// From raw to engineering units; `None` where the raw value is the value.
+    scale: Option<Scale>,
 }
 
 #[derive(Debug)]
@@ -76,13 +100,13 @@ impl Tags {
             next_second: None,
         };
         for (tag, sample) in table.tags.iter().zip(&mut state.samples) {
-            if matches!(&tag.source, Source::Derived(crate::mapping::Derived::Constant { .. })) {
+            if matches!(&tag.source, Source::Derived(Derived::Constant { .. })) {
                 sample.received = now.utc;
                 sample.received_at = Some(now.instant);
             }
         }
         for node in &layout.nodes {
-            state.compute_outdated(table, &layout, node, now);
+            state.compute_outdated(table, &layout, &node.derived, now);
         }
         Self { layout, state }
     }
@@ -92,54 +116,60 @@ impl Tags {
         &self.state.samples
     }
 
-    /// Takes a TPDO: its tags, and all that is computed from them. Whether a value or a quality changed.
-    pub(super) fn apply_pdo(
+    /// Takes new data of a carrier: its tags, and all that is computed from them. Whether a value or a quality changed.
+    pub(super) fn apply(
         &mut self,
         table: &TagTable,
         now: Now,
-        (node, pdo): (NodeIndex, PdoIndex),
+        (node, carrier): (NodeIndex, CarrierIndex),
         data: &[u8],
         quality: Quality,
     ) -> bool {
         let Self { layout, state } = self;
-        let Some(node) = layout.nodes.get(node.0) else { return false };
-        let Some(pdo) = node.pdos.get(pdo.0) else { return false };
+        let node = layout.nodes.get(node.0);
+        let Some(carrier) = node.and_then(|node| node.carriers.get(carrier.0)) else { return false };
         let mut changed = false;
-        for tag in &pdo.tags {
-            let Some(Source::Pdo { field, scale, .. }) = table.tag(*tag).map(|tag| &tag.source) else {
-                continue;
-            };
+        for Placed { tag, field, scale } in &carrier.placed {
             let Some(raw) = codec::decode(field, data) else { continue };
-            changed |= state.store(layout, *tag, raw, codec::scale(scale, raw), quality);
+            let value = scale.as_ref().map_or(raw, |scale| codec::scale(scale, raw));
+            changed |= state.store(layout, *tag, raw, value, quality);
             state.receive(*tag, now);
         }
-        for tag in &pdo.computed {
+        for tag in &carrier.computed {
             state.receive(*tag, now);
         }
-        changed | state.compute_outdated(table, layout, node, now)
+        changed | state.compute_outdated(table, layout, &carrier.computed, now)
     }
 
-    /// The tags of a node, or of one of its TPDOs, can be trusted less from now on. A quality never gets better this
+    /// The tags of a node, or of one of its carriers, can be trusted less from now on. A quality never gets better this
     /// way: only newly received data makes a tag good again (R-DET-037). Whether anything changed.
     pub(super) fn degrade(
         &mut self,
         table: &TagTable,
         now: Now,
         node: NodeIndex,
-        pdo: Option<PdoIndex>,
+        carrier: Option<CarrierIndex>,
         quality: Quality,
     ) -> bool {
         let Self { layout, state } = self;
         let Some(node) = layout.nodes.get(node.0) else { return false };
-        let pdos = node.pdos.iter().enumerate();
-        let of = pdos.filter(|(place, _)| pdo.is_none_or(|pdo| pdo.0 == *place));
+        let carriers = node.carriers.iter().enumerate();
+        let of = carriers.filter(|(place, _)| carrier.is_none_or(|carrier| carrier.0 == *place));
         let mut changed = false;
-        for tag in of.flat_map(|(_, pdo)| &pdo.tags) {
-            let Some(sample) = state.samples.get(tag.0).copied() else { continue };
+        for placed in of.flat_map(|(_, carrier)| &carrier.placed) {
+            let Some(sample) = state.samples.get(placed.tag.0).copied() else { continue };
             let worse = degraded(sample.quality, quality);
-            changed |= state.store(layout, *tag, sample.raw, sample.value, worse);
+            changed |= state.store(layout, placed.tag, sample.raw, sample.value, worse);
         }
-        changed | state.compute_outdated(table, layout, node, now)
+        changed | state.compute_outdated(table, layout, &node.derived, now)
+    }
+
+    /// Whether all that a node's device sends is good: each tag that stands in one of its carriers.
+    pub(super) fn all_good(&self, node: NodeIndex) -> bool {
+        let carriers = self.layout.nodes.get(node.0).map(|node| node.carriers.as_slice()).unwrap_or_default();
+        let mut placed = carriers.iter().flat_map(|carrier| &carrier.placed);
+        placed
+            .all(|placed| self.state.samples.get(placed.tag.0).is_some_and(|sample| sample.quality.is_good()))
     }
 
     /// Opens the latches of a node, or of all nodes, whose source is not set.
@@ -153,7 +183,7 @@ impl Tags {
                     *outdated = true;
                 }
             }
-            state.compute_outdated(table, layout, node, now);
+            state.compute_outdated(table, layout, &node.derived, now);
         }
     }
 
@@ -170,7 +200,7 @@ impl Tags {
             }
         }
         for node in &layout.nodes {
-            state.compute_outdated(table, layout, node, now);
+            state.compute_outdated(table, layout, &node.derived, now);
         }
     }
 
@@ -220,40 +250,46 @@ impl Layout {
         let mut dependents: Vec<Vec<TagIndex>> = vec![Vec::new(); table.tags.len()];
         for (place, tag) in table.tags.iter().enumerate() {
             if let Source::Derived(derived) = &tag.source {
-                for input in derived::inputs(derived) {
+                derived.for_each_input(&mut |input| {
                     if let Some(dependents) = dependents.get_mut(input.0) {
                         dependents.push(TagIndex(place));
                     }
-                }
+                });
             }
         }
-        let nodes = table.nodes.iter().map(|node| {
-            let tags =
-                || node.tags.clone().filter_map(|place| Some((TagIndex(place), table.tags.get(place)?)));
-            let pdos = (0..node.canopen.pdos.len()).map(|number| {
-                let is_in = |source: &Source| matches!(source, Source::Pdo { pdo, .. } if *pdo == number);
-                let tags: Vec<TagIndex> =
-                    tags().filter(|(_, tag)| is_in(&tag.source)).map(|(tag, _)| tag).collect();
-                let computed = computed_from(&tags, &dependents);
-                PdoLayout { tags, computed }
-            });
-            NodeLayout {
-                pdos: pdos.collect(),
-                derived: tags()
-                    .filter(|(_, tag)| matches!(tag.source, Source::Derived(_)))
-                    .map(|(tag, _)| tag)
-                    .collect(),
-            }
-        });
-        let nodes = nodes.collect();
+        let nodes = table.nodes.iter().map(|node| NodeLayout::new(table, node, &dependents)).collect();
         Self { nodes, dependents }
     }
 }
 
+impl NodeLayout {
+    fn new(table: &TagTable, node: &NodeDef, dependents: &[Vec<TagIndex>]) -> Self {
+        let mut carriers = Vec::new();
+        carriers.resize_with(node.canopen.pdos.len(), CarrierLayout::default);
+        let mut derived = Vec::new();
+        for tag in node.tags.clone().map(TagIndex) {
+            match table.tag(tag).map(|tag| &tag.source) {
+                Some(Source::Pdo { pdo, field, scale }) => {
+                    let scale = (*scale != Scale::IDENTITY).then_some(*scale);
+                    if let Some(carrier) = carriers.get_mut(*pdo) {
+                        carrier.placed.push(Placed { tag, field: *field, scale });
+                    }
+                }
+                Some(Source::Derived(_)) => derived.push(tag),
+                None => {}
+            }
+        }
+        for carrier in &mut carriers {
+            carrier.computed = computed_from(carrier.placed.iter().map(|placed| placed.tag), dependents);
+        }
+        Self { carriers, derived }
+    }
+}
+
 /// All tags that are computed from some tags, however indirectly.
-fn computed_from(tags: &[TagIndex], dependents: &[Vec<TagIndex>]) -> Vec<TagIndex> {
-    let mut found = std::collections::BTreeSet::new();
-    let mut next = tags.to_vec();
+fn computed_from(tags: impl Iterator<Item = TagIndex>, dependents: &[Vec<TagIndex>]) -> Vec<TagIndex> {
+    let mut found = BTreeSet::new();
+    let mut next: Vec<TagIndex> = tags.collect();
     while let Some(tag) = next.pop() {
         for dependent in dependents.get(tag.0).into_iter().flatten() {
             if found.insert(*dependent) {
@@ -292,9 +328,17 @@ impl State {
         }
     }
 
-    fn compute_outdated(&mut self, table: &TagTable, layout: &Layout, node: &NodeLayout, now: Now) -> bool {
+    /// Computes those of some derived tags of which an input has changed. Inputs are to come before what is computed
+    /// from them, as in the table.
+    fn compute_outdated(
+        &mut self,
+        table: &TagTable,
+        layout: &Layout,
+        derived: &[TagIndex],
+        now: Now,
+    ) -> bool {
         let mut changed = false;
-        for tag in &node.derived {
+        for tag in derived {
             let outdated = self.outdated.get_mut(tag.0).is_some_and(std::mem::take);
             if outdated {
                 changed |= self.compute(table, layout, *tag, now);

@@ -118,12 +118,13 @@ fn saturated(counts: f64, lowest: f64, highest: f64) -> u64 {
     counts.round().clamp(lowest, highest) as i64 as u64
 }
 
-#[expect(clippy::as_conversions, clippy::cast_sign_loss, reason = "the bits as they stood in the frame")]
-fn raw_bits(raw: Value) -> u64 {
+/// The bits of a raw value; a negative number has all its upper ones set.
+#[must_use]
+pub fn raw_bits(raw: Value) -> u64 {
     match raw {
         Value::Bool(bit) => u64::from(bit),
         Value::Unsigned(number) => number,
-        Value::Signed(number) => number as u64,
+        Value::Signed(number) => number.cast_unsigned(),
         Value::Float(number) => number.to_bits(),
     }
 }

@@ -20,6 +20,8 @@ pub struct NodeStatus {
     pub simulated: bool,
     /// The gateway sends nothing to this node's bus.
     pub passive: bool,
+    /// All values that the device sends are good.
+    pub data_good: bool,
     /// One entry for each TPDO of the mapping, in its order.
     pub pdos: Vec<PdoStatus>,
     /// Counters since the start of the gateway.
@@ -36,31 +38,23 @@ impl NodeStatus {
     /// Copies a newer status. Where more changed than what moves with every frame, `revision` is noted and the answer
     /// is `true`. Allocates nothing unless the reason is another.
     pub fn update(&mut self, newer: &Self, revision: Revision) -> bool {
-        let Self { online, reason, nmt, supervised, identity_mismatch, simulated, passive, .. } = newer;
-        let facts = [*online, *supervised, *identity_mismatch, *simulated, *passive];
-        let shown = [self.online, self.supervised, self.identity_mismatch, self.simulated, self.passive];
-        let counters = NodeCounters { frames_received: self.counters.frames_received, ..newer.counters };
-        let stale =
-            |status: &Self| status.pdos.iter().fold(0_u64, |bits, pdo| bits << 1 | u64::from(pdo.stale));
-        let moved = facts != shown
-            || self.reason != *reason
-            || self.nmt != *nmt
-            || self.counters != counters
-            || self.generation != newer.generation
-            || stale(self) != stale(newer);
-        if self.reason != *reason {
-            self.reason.clone_from(reason);
-        }
-        [self.online, self.supervised, self.identity_mismatch, self.simulated, self.passive] = facts;
-        self.nmt = *nmt;
-        self.pdos.clone_from(&newer.pdos);
-        self.counters = newer.counters;
+        // What moves with every frame is taken over first: what differs after that is news.
+        self.counters.frames_received = newer.counters.frames_received;
         self.newest_data = newer.newest_data;
-        self.generation = newer.generation;
-        if moved {
-            self.revision = revision;
+        for (shown, newer) in self.pdos.iter_mut().zip(&newer.pdos) {
+            shown.last_received = newer.last_received;
+            shown.received = newer.received;
         }
-        moved
+        let before = std::mem::replace(&mut self.revision, newer.revision);
+        if *self == *newer {
+            self.revision = before;
+            return false;
+        }
+        let (mut reason, mut pdos) = (std::mem::take(&mut self.reason), std::mem::take(&mut self.pdos));
+        reason.clone_from(&newer.reason);
+        pdos.clone_from(&newer.pdos);
+        *self = Self { reason, pdos, revision, ..*newer };
+        true
     }
 }
 
@@ -73,6 +67,8 @@ pub struct PdoStatus {
     pub last_received: Option<Instant>,
     /// Did not come in time while it was expected.
     pub stale: bool,
+    /// What it carried last may still be used: neither too old, nor spoilt by what happened to its node or bus since.
+    pub usable: bool,
     /// Times received with a usable length.
     pub received: u64,
 }
@@ -299,4 +295,33 @@ pub struct AlarmStatus {
     pub value: Option<Value>,
     /// When it changed last.
     pub revision: Revision,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_moves_with_every_frame_is_copied_and_is_no_news() {
+        let mut shown = NodeStatus { pdos: vec![PdoStatus::default(); 2], ..NodeStatus::default() };
+        let mut newer = shown.clone();
+        newer.counters.frames_received = 7;
+        newer.newest_data = Some(Timestamp::from_millis(5));
+        newer.pdos[1] = PdoStatus { last_received: Some(Instant::START), received: 3, ..newer.pdos[1] };
+        assert!(!shown.update(&newer, Revision(1)));
+        assert_eq!(shown, newer);
+        newer.data_good = true;
+        assert!(shown.update(&newer, Revision(2)));
+        assert_eq!(shown, NodeStatus { revision: Revision(2), ..newer });
+    }
+
+    #[test]
+    fn of_any_number_of_tpdos_each_is_looked_at() {
+        let mut shown = NodeStatus { pdos: vec![PdoStatus::default(); 512], ..NodeStatus::default() };
+        for place in [0, 63, 64, 511] {
+            let mut newer = shown.clone();
+            newer.pdos[place].stale = true;
+            assert!(shown.update(&newer, Revision(1)), "TPDO{}", place + 1);
+        }
+    }
 }
