@@ -2,12 +2,10 @@
 //!
 //! The files are written by hand. No switch renews them: whoever breaks a promise has to edit it knowingly.
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use cangate::mapping::installation::{BusEntry, NodeEntry};
-use cangate::mapping::{At, Installation, SourceText, TagTable, build};
+use cangate::mapping::{Sketch, TagTable};
 use cangate::modbus::map_text::{MapFormat, diff, render};
 use cangate::modbus::{MapDocument, ModbusSettings, RegisterMap};
 
@@ -18,17 +16,7 @@ fn fixture(name: &str) -> String {
 
 /// The example of the documentation: one DetCon.
 fn detcon() -> TagTable {
-    let at = |text: &str| At::nowhere(text.to_owned());
-    let installation = Installation {
-        gateway: "hall-1",
-        gateway_unit_id: 247,
-        config: &SourceText::new("cangate.toml", ""),
-        buses: &BTreeMap::from([(at("can0"), BusEntry::virtual_bus("can0"))]),
-        nodes: &BTreeMap::from([(at("engine1"), NodeEntry::new("can0", 1, "motortech-detcon"))]),
-        mappings: &BTreeMap::new(),
-        lost: &[],
-    };
-    build(&installation).unwrap().0
+    Sketch::new().node("engine1", 1, "motortech-detcon", |_| ()).build().unwrap().0
 }
 
 fn register_map() -> RegisterMap {

@@ -9,35 +9,22 @@ mod guarding;
 mod starting;
 mod tpdos;
 
-use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 
 use cangate::mapping::installation::{BusEntry, NodeEntry};
-use cangate::mapping::{At, Encoding, Installation, SourceText, TagTable, build, codec};
+use cangate::mapping::{Encoding, Sketch, TagTable, codec};
 use cangate::process_image::Value;
 
 use crate::support::conversation::Conversation;
 
 /// A table of DetCon nodes on one bus, with what the test changes.
 pub fn table(nodes: &[(&str, u8)], change: impl Fn(&mut BusEntry, &mut NodeEntry)) -> TagTable {
-    let at = |text: &str| At::nowhere(text.to_owned());
     let mut bus = BusEntry::virtual_bus("can0");
-    let mut entries = BTreeMap::new();
+    let mut sketch = Sketch::new();
     for (name, id) in nodes {
-        let mut node = NodeEntry::new("can0", *id, "motortech-detcon");
-        change(&mut bus, &mut node);
-        entries.insert(at(name), node);
+        sketch = sketch.node(name, *id, "motortech-detcon", |node| change(&mut bus, node));
     }
-    let installation = Installation {
-        gateway: "test",
-        gateway_unit_id: 247,
-        config: &SourceText::new("test.toml", ""),
-        buses: &BTreeMap::from([(at("can0"), bus)]),
-        nodes: &entries,
-        mappings: &BTreeMap::new(),
-        lost: &[],
-    };
-    build(&installation).unwrap_or_else(|problems| panic!("{problems:#?}")).0
+    sketch.bus(|entry| *entry = bus).build().unwrap().0
 }
 
 /// Node 1, with the changes of a test.

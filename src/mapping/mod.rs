@@ -31,7 +31,7 @@ pub mod table;
 pub mod testing;
 
 pub use at::At;
-pub use build::{Installation, build, check_mapping, is_name, sort_problems};
+pub use build::{Installation, Sketch, build, check_mapping, is_name, sort_problems};
 pub use diagnostic::{Diagnostic, Severity, SourceText};
 pub use expression::Expression;
 pub use reader::{is_mapping, locate};

@@ -1,25 +1,16 @@
 //! A made-up installation, small enough to read: two engines on one bus, and images of it.
 
 use std::sync::Arc;
-use std::time::Duration;
 
-use cangate::can::{BusIndex, CanId};
-use cangate::canopen::settings::{ErrorControl, GuardingSettings, PdoSettings, StartSettings};
-use cangate::canopen::{NodeId, NodeSettings, Role};
-use cangate::mapping::{
-    AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, BusDef, DeviceDef, Field, FieldKind, NodeDef, OnLoss,
-    PublishDef, Scale, Source, TagDef, TagTable,
-};
+use cangate::mapping::{AlarmDef, Sketch, SourceText, TagTable};
 use cangate::process_image::{
-    AlarmState, AlarmStatus, BusState, BusStatus, Event, EventKind, NmtState, NodeIndex, NodeStatus,
-    PdoStatus, Priority, ProcessImage, Quality, Reason, Revision, Sample, TagIndex, Value,
+    AlarmState, AlarmStatus, BusState, BusStatus, Event, EventKind, NmtState, NodeStatus, PdoStatus,
+    ProcessImage, Quality, Reason, Revision, Sample, Value,
 };
 use cangate::time::{Instant, Now, Timestamp};
 
-/// Tags of each engine, in this order.
-pub const TAGS: [&str; 4] = ["knock_intensity_1", "sensor_used_1", "trip", "engine_knocking"];
-/// Alarms: the gateway's, the bus's, then these of each engine.
-pub const ALARMS: [&str; 3] = ["node_lost", "pdo_timeout_1", "trip"];
+/// Alarms: `mqtt_down` of the gateway, `bus_off` of the bus, then these of each engine.
+const ALARMS: [&str; 3] = ["node_lost", "pdo_timeout_1", "trip"];
 
 /// The wall clock of the made-up images: a moment in November 2025.
 pub const MORNING_MS: i64 = 1_763_760_000_123;
@@ -32,117 +23,87 @@ pub fn at(millis: u64) -> Now {
     }
 }
 
+const ENGINE: &str = r#"
+format = 1
+
+[device]
+vendor = "MOTORTECH"
+model = "DetCon20"
+description = "Anti-knock controller"
+
+[publish]
+fast_while = "engine_knocking"
+
+[tpdo.1]
+cob_id = "$NODEID+0x180"
+length = 8
+timeout_ms = 1500
+
+[[tag]]
+name = "knock_intensity_1"
+description = "What `knock_intensity_1` means."
+tpdo = 1
+bit = 0
+type = "u8"
+unit = "%"
+decimals = 2
+deadband = 0.5
+valid = "sensor_used_1"
+
+[[tag]]
+name = "sensor_used_1"
+description = "What `sensor_used_1` means."
+tpdo = 1
+bit = 8
+type = "bool"
+
+[[tag]]
+name = "trip"
+description = "What `trip` means."
+tpdo = 1
+bit = 9
+type = "bool"
+
+[[tag]]
+name = "engine_knocking"
+description = "What `engine_knocking` means."
+tpdo = 1
+bit = 10
+type = "bool"
+
+[[alarm]]
+name = "trip"
+when = "trip"
+value = "knock_intensity_1"
+priority = "critical"
+text = ""
+action = ""
+"#;
+
 /// Two engines, or as many as asked for.
-pub fn table(engines: usize) -> Arc<TagTable> {
-    let mut table = TagTable {
-        gateway: "hall-1".into(),
-        buses: vec![BusDef {
-            name: "can0".into(),
-            role: Role::Master,
-            bit_rate: 125_000,
-            start_broadcast: false,
-        }],
-        ..TagTable::default()
-    };
-    table.alarms.push(alarm("mqtt_down", AlarmOwner::Gateway, BuiltIn::MqttDown, Priority::Medium));
-    table.alarms.push(alarm("bus_off", AlarmOwner::Bus(BusIndex(0)), BuiltIn::BusOff, Priority::High));
-    for place in 0..engines {
-        engine(&mut table, NodeIndex(place));
+///
+/// Of the built-in alarms only a few are there, so that a test can name each by its place.
+pub fn table(engines: u8) -> Arc<TagTable> {
+    let mapping = SourceText::new("motortech-detcon", ENGINE);
+    let sketch = (1..=engines).fold(Sketch::new().mapping(mapping), |sketch, id| {
+        sketch.node(&format!("engine{id}"), id, "motortech-detcon", |_| ())
+    });
+    let mut table = sketch.build().unwrap().0;
+    let kept =
+        |alarm: &AlarmDef| ["mqtt_down", "bus_off"].into_iter().chain(ALARMS).any(|name| name == alarm.name);
+    table.alarms.retain(kept);
+    for (place, node) in table.nodes.iter_mut().enumerate() {
+        let first = 2 + place * ALARMS.len();
+        node.alarms = first..first + ALARMS.len();
+    }
+    for alarm in &mut table.alarms {
+        // Their places are others now.
+        alarm.suppressed_by.clear();
+        alarm.text = format!("The text of {}.", alarm.name);
+        alarm.action = "Look at the \"engine\".".into();
+        alarm.bit = None;
     }
     Arc::new(table)
-}
-
-fn engine(table: &mut TagTable, node: NodeIndex) {
-    let (tags, alarms) = (table.tags.len(), table.alarms.len());
-    for name in TAGS {
-        table.tags.push(tag(node, name, tags));
-    }
-    let owner = AlarmOwner::Node(node);
-    table.alarms.push(alarm(ALARMS[0], owner, BuiltIn::NodeLost, Priority::High));
-    table.alarms.push(alarm(ALARMS[1], owner, BuiltIn::PdoTimeout(0), Priority::Medium));
-    table.alarms.push(alarm(ALARMS[2], owner, BuiltIn::PdoTimeout(0), Priority::Critical));
-    let id = u8::try_from(node.0 + 1).unwrap();
-    table.nodes.push(NodeDef {
-        name: format!("engine{id}"),
-        bus: BusIndex(0),
-        canopen: NodeSettings {
-            id: NodeId::new(id).unwrap(),
-            error_control: ErrorControl::Guarding(GuardingSettings::default()),
-            start: StartSettings::default(),
-            pdos: vec![PdoSettings {
-                number: 1,
-                cob_id: CanId::standard(0x180 + u16::from(id)).unwrap(),
-                length: 8,
-                strict_length: false,
-                timeout: Some(Duration::from_millis(1500)),
-                shortest_period: None,
-            }],
-            never_seen_after: Duration::from_secs(3),
-        },
-        device: DeviceDef {
-            mapping: "motortech-detcon".into(),
-            vendor: "MOTORTECH".into(),
-            model: "DetCon20".into(),
-            description: "Anti-knock controller".into(),
-        },
-        unit_id: id,
-        offset: 0,
-        on_loss: OnLoss::Invalid,
-        zero_on_bad: false,
-        tags: tags..table.tags.len(),
-        alarms: alarms..table.alarms.len(),
-        reserved_bits: vec![0],
-        publish: PublishDef {
-            min_interval: Duration::from_millis(500),
-            fast_interval: Duration::from_millis(100),
-            fast_while: Some(TagIndex(tags + 3)),
-            max_interval: Duration::from_secs(10),
-        },
-    });
-}
-
-fn tag(node: NodeIndex, name: &str, first: usize) -> TagDef {
-    let number = name == TAGS[0];
-    TagDef {
-        node,
-        name: name.into(),
-        description: format!("What `{name}` means."),
-        unit: if number { "%".into() } else { String::new() },
-        decimals: 2,
-        source: Source::Pdo {
-            pdo: 0,
-            field: Field {
-                bit: 0,
-                width: if number { 8 } else { 1 },
-                kind: if number { FieldKind::Unsigned } else { FieldKind::Bool },
-                big_endian: false,
-                invert: false,
-            },
-            scale: Scale::IDENTITY,
-        },
-        valid: number.then_some(TagIndex(first + 1)),
-        registers: Vec::new(),
-        published: true,
-        deadband: if number { 0.5 } else { 0.0 },
-    }
-}
-
-fn alarm(name: &str, owner: AlarmOwner, condition: BuiltIn, priority: Priority) -> AlarmDef {
-    AlarmDef {
-        name: name.into(),
-        owner,
-        condition: AlarmCondition::BuiltIn(condition),
-        priority,
-        on_delay: Duration::ZERO,
-        off_delay: Duration::ZERO,
-        latch: false,
-        suppressed_by: Vec::new(),
-        first_out: false,
-        bit: None,
-        value: (name == "trip").then_some(TagIndex(0)),
-        text: format!("The text of {name}."),
-        action: "Look at the \"engine\".".into(),
-    }
 }
 
 /// An image in which all engines run and are well, at 0 ms.
@@ -165,7 +126,13 @@ pub fn image(table: &TagTable) -> ProcessImage {
             nmt: Some(NmtState::Operational),
             supervised: true,
             newest_data: Some(at(0).utc),
-            pdos: vec![PdoStatus { number: 1, last_received: Some(Instant::START), ..PdoStatus::default() }],
+            data_good: true,
+            pdos: vec![PdoStatus {
+                number: 1,
+                last_received: Some(Instant::START),
+                usable: true,
+                ..PdoStatus::default()
+            }],
             ..NodeStatus::default()
         };
         let values = [Value::Float(12.549_019_6), Value::Bool(true), Value::Bool(false), Value::Bool(false)];
@@ -194,6 +161,8 @@ pub fn lose(image: &mut ProcessImage, table: &TagTable, node: usize, at: Now) {
     image.nodes[node].online = false;
     image.nodes[node].nmt = None;
     image.nodes[node].reason = "no guarding reply for 1.5 s".into();
+    image.nodes[node].data_good = false;
+    image.nodes[node].pdos.iter_mut().for_each(|pdo| pdo.usable = false);
     for tag in table.nodes[node].tags.clone() {
         image.tags[tag].quality = Quality::Bad(Reason::NodeLost);
     }

@@ -7,8 +7,7 @@ use std::time::Duration;
 use cangate::can::{BusEvent, BusIndex, CanFrame, Link};
 use cangate::canopen::NodeId;
 use cangate::gateway::{Gateway, Input, Output};
-use cangate::mapping::installation::{BusEntry, NodeEntry};
-use cangate::mapping::{At, Installation, Source, SourceText, TagTable, build};
+use cangate::mapping::{Sketch, Source, TagTable};
 use cangate::process_image::{NodeIndex, NodeStatus, ProcessImage, Quality, Sample};
 use cangate::simulator::random::Random;
 use cangate::simulator::{Control, DevicePlan, Order, Scenario, SimulatedDevice};
@@ -18,20 +17,10 @@ const BUS: BusIndex = BusIndex(0);
 
 /// An installation of `count` devices on one bus: `node001` with node id 1, and so on.
 pub fn installation(count: u8) -> Arc<TagTable> {
-    let at = |text: String| At::nowhere(text);
-    let buses = BTreeMap::from([(at("can0".into()), BusEntry::virtual_bus("can0"))]);
-    let entry = |id| NodeEntry::new("can0", id, "motortech-detcon");
-    let nodes = (1..=count).map(|id| (at(format!("node{id:03}")), entry(id))).collect();
-    let installation = Installation {
-        gateway: "test",
-        gateway_unit_id: 247,
-        config: &SourceText::new("test.toml", ""),
-        buses: &buses,
-        nodes: &nodes,
-        mappings: &BTreeMap::new(),
-        lost: &[],
-    };
-    Arc::new(build(&installation).unwrap_or_else(|problems| panic!("{problems:#?}")).0)
+    let sketch = (1..=count).fold(Sketch::new(), |sketch, id| {
+        sketch.node(&format!("node{id:03}"), id, "motortech-detcon", |_| ())
+    });
+    Arc::new(sketch.build().unwrap().0)
 }
 
 /// What the bus does to frames. The default is a good bus: each frame arrives once, 200 us later.

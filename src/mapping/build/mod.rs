@@ -6,6 +6,7 @@
 //! - `alarms`: alarms, their order and what suppresses them.
 //! - `addresses`, `network`: what must not happen twice among nodes.
 //! - `order`: causes before consequences. `problems`: where messages are collected.
+//! - [`sketch`]: an installation without a configuration file.
 
 mod addresses;
 mod alarms;
@@ -16,6 +17,7 @@ mod network;
 mod node;
 mod order;
 mod problems;
+pub mod sketch;
 mod tags;
 #[cfg(test)]
 mod tests;
@@ -29,6 +31,7 @@ use self::network::Taken;
 use self::node::Tpdo;
 use self::problems::Problems;
 pub use self::problems::{is_name, is_snake_case, sort_problems};
+pub use self::sketch::Sketch;
 use self::tags::Context;
 use super::file::MappingFile;
 use super::installation::{BusEntry, NodeEntry};
@@ -88,22 +91,8 @@ pub fn build(installation: &Installation<'_>) -> Result<(TagTable, Vec<Diagnosti
 
 /// Checks one mapping by itself, as if one node of an installation used it. Warnings, or everything that is wrong.
 pub fn check_mapping(source: &SourceText) -> Result<Vec<Diagnostic>, Vec<Diagnostic>> {
-    let config = SourceText::new("", "");
-    let bus = BusEntry::virtual_bus("check");
-    let entry = NodeEntry::new("check", 1, &source.name);
-    let buses = BTreeMap::from([(At::nowhere("check".to_owned()), bus)]);
-    let nodes = BTreeMap::from([(At::nowhere("check".to_owned()), entry)]);
-    let mappings = BTreeMap::from([(source.name.clone(), source.clone())]);
-    let installation = Installation {
-        gateway: "check",
-        gateway_unit_id: 247,
-        config: &config,
-        buses: &buses,
-        nodes: &nodes,
-        mappings: &mappings,
-        lost: &[],
-    };
-    build(&installation).map(|(_, warnings)| warnings)
+    let sketch = Sketch::new().mapping(source.clone()).node("check", 1, &source.name, |_| ());
+    sketch.build().map(|(_, warnings)| warnings)
 }
 
 fn buses(problems: &mut Problems, installation: &Installation<'_>) -> Vec<BusDef> {
