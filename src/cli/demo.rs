@@ -1,6 +1,6 @@
 //! `cangate demo`: two simulated engines, a broker and the gateway in one process. \[IO\]
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
@@ -10,6 +10,7 @@ use super::output::{block_on, print_error, print_line};
 use super::{Exit, load, run};
 use crate::can::interface::Interface;
 use crate::can::{self, BusIndex};
+use crate::mqtt::settings::BrokerUrl;
 use crate::simulator;
 use crate::simulator::task::BusEnd;
 use crate::supervisor::{self, Tasks, shutdown};
@@ -57,14 +58,15 @@ pub(super) fn run(options: &DemoArguments) -> Exit {
                 return Exit::Io;
             }
         };
-        if let Some(mqtt) = &mut installation.mqtt {
-            match broker.url().parse() {
-                Ok(url) => mqtt.url = url,
-                Err(error) => {
-                    print_error(&format!("--broker: {error}"));
-                    return Exit::Usage;
-                }
+        let broker_url: BrokerUrl = match broker.url().parse() {
+            Ok(url) => url,
+            Err(error) => {
+                print_error(&format!("--broker: {error}"));
+                return Exit::Usage;
             }
+        };
+        if let Some(mqtt) = &mut installation.mqtt {
+            mqtt.url = broker_url.clone();
         }
         let clock = Clock::start();
         let bound = match supervisor::bind(installation, clock).await {
@@ -74,7 +76,7 @@ pub(super) fn run(options: &DemoArguments) -> Exit {
                 return Exit::Io;
             }
         };
-        tell(&bound, &broker);
+        tell(&bound, &broker_url);
         // A demo whose engines or broker died would go on without a word.
         let mut tasks = Tasks::default();
         tasks.spawn("simulated engines", simulate(clock, stop.clone()));
@@ -98,16 +100,18 @@ async fn simulate(clock: Clock, stop: CancellationToken) {
     let (_, lines) = mpsc::channel(1);
     let bus = can::task::run(BusIndex(0), interface, false, events_to_us, to_send, clock, stop.clone());
     let end = BusEnd { events, transmit };
-    tokio::join!(bus, simulator::task::run(simulator::demo(), end, lines, std::io::sink(), clock, stop));
+    // No reports either: what the engines do is seen through the gateway.
+    let (report, _) = mpsc::channel(1);
+    tokio::join!(bus, simulator::task::run(simulator::demo(), end, lines, report, clock, stop));
 }
 
 /// The three lines that a newcomer can paste, and what there is to see.
-fn tell(bound: &supervisor::Bound, broker: &Broker) {
+fn tell(bound: &supervisor::Bound, broker: &BrokerUrl) {
     let modbus = bound.modbus_addresses().first().copied();
     let (host, port) =
-        modbus.map_or((String::new(), 0), |address| (address.ip().to_string(), address.port()));
-    let (broker_host, broker_port) = broker.host_and_port();
-    let page = format!("http://{}/", bound.http_address());
+        modbus.map_or((String::new(), 0), |address| (reachable(address).ip().to_string(), address.port()));
+    let (broker_host, broker_port) = host_and_port(broker);
+    let page = format!("http://{}/", reachable(bound.http_address()));
     for line in [
         "cangate demo: two simulated engines; Ctrl-C ends it. Connect from another terminal:".to_owned(),
         String::new(),
@@ -123,6 +127,25 @@ fn tell(bound: &supervisor::Bound, broker: &Broker) {
             return;
         }
     }
+}
+
+/// An address that can be connected to: whoever listens on all addresses (`0.0.0.0`) is reached at the loopback address,
+/// through the published port of a container too.
+fn reachable(address: SocketAddr) -> SocketAddr {
+    match address.ip() {
+        IpAddr::V4(ip) if ip.is_unspecified() => SocketAddr::new(Ipv4Addr::LOCALHOST.into(), address.port()),
+        IpAddr::V6(ip) if ip.is_unspecified() => SocketAddr::new(Ipv6Addr::LOCALHOST.into(), address.port()),
+        IpAddr::V4(_) | IpAddr::V6(_) => address,
+    }
+}
+
+/// The same for a broker, as its clients take it.
+fn host_and_port(broker: &BrokerUrl) -> (String, u16) {
+    let host = match broker.host.parse::<IpAddr>() {
+        Ok(ip) => reachable(SocketAddr::new(ip, broker.port)).ip().to_string(),
+        Err(_) => broker.host.clone(),
+    };
+    (host, broker.port)
 }
 
 /// The broker that the demo publishes to.
@@ -143,7 +166,14 @@ impl Broker {
     #[cfg(feature = "embedded-broker")]
     async fn start_inside(address: SocketAddr) -> Result<Self, String> {
         let broker = crate::mqtt::broker::EmbeddedBroker::start(address).await;
-        broker.map(Self::Inside).map_err(|error| format!("{error} (choose another address with --mqtt)"))
+        broker.map(Self::Inside).map_err(|error| {
+            let there = host_and_port(&BrokerUrl { host: address.ip().to_string(), port: address.port() });
+            let there = BrokerUrl { host: there.0, port: there.1 };
+            format!(
+                "{error} Use the broker that is there already with `--broker {there}`, or choose another address with \
+                 --mqtt."
+            )
+        })
     }
 
     #[cfg(not(feature = "embedded-broker"))]
@@ -159,13 +189,6 @@ impl Broker {
             Self::Inside(broker) => format!("mqtt://{}", broker.local_addr()),
             Self::Outside(url) => url.clone(),
         }
-    }
-
-    fn host_and_port(&self) -> (String, String) {
-        let url = self.url();
-        let address = url.strip_prefix("mqtt://").unwrap_or(&url);
-        let (host, port) = address.rsplit_once(':').unwrap_or((address, "1883"));
-        (host.trim_matches(['[', ']']).to_owned(), port.to_owned())
     }
 
     /// Returns early when the broker ends by itself; else gives it `back` at the stop.
@@ -195,5 +218,43 @@ impl Broker {
             Self::Inside(broker) => broker.shutdown().await,
             Self::Outside(_) => {}
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_engines_of_the_demo_are_the_nodes_that_its_gateway_knows() {
+        let installation = load::installation_from_text(CONFIGURATION, "demo").unwrap();
+        let configured: Vec<u8> = installation.table.nodes.iter().map(|node| node.canopen.id.get()).collect();
+        let simulated: Vec<u8> = simulator::demo().iter().map(|plan| plan.node.get()).collect();
+        assert_eq!(configured, simulated);
+    }
+
+    #[test]
+    fn what_is_printed_can_be_pasted_wherever_the_demo_listens() {
+        let shown = |address: &str| reachable(address.parse().unwrap()).to_string();
+        assert_eq!(shown("0.0.0.0:5020"), "127.0.0.1:5020");
+        assert_eq!(shown("[::]:5020"), "[::1]:5020");
+        assert_eq!(shown("192.0.2.7:5020"), "192.0.2.7:5020");
+        for (url, host, port) in [
+            ("mqtt://[::1]:1884", "::1", 1884),
+            ("mqtt://[::1]", "::1", 1883),
+            ("mqtt://0.0.0.0:1883", "127.0.0.1", 1883),
+            ("mqtt://mosquitto", "mosquitto", 1883),
+        ] {
+            assert_eq!(host_and_port(&url.parse().unwrap()), (host.to_owned(), port), "{url}");
+        }
+    }
+
+    #[cfg(feature = "embedded-broker")]
+    #[tokio::test]
+    async fn where_a_broker_listens_already_the_demo_offers_to_use_it() {
+        let taken = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = taken.local_addr().unwrap();
+        let error = Broker::start_inside(address).await.err().unwrap();
+        assert!(error.contains(&format!("--broker mqtt://{address}`")), "{error}");
     }
 }

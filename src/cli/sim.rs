@@ -1,8 +1,13 @@
 //! `cangate sim`: simulated devices on a bus, with orders from the standard input. \[IO\]
 
-use std::io::{BufRead, BufReader, Write};
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, IsTerminal, Read, Write};
+use std::os::fd::AsFd;
+use std::time::Duration;
 
-use tokio::sync::mpsc;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::unistd::{getpgrp, tcgetpgrp};
+use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
 use super::Exit;
@@ -23,6 +28,14 @@ const TRANSMIT_QUEUE: usize = 1024;
 const EVENT_QUEUE: usize = 1024;
 /// Lines that wait; when there are more, reading pauses.
 const LINE_QUEUE: usize = 64;
+/// Longest line in bytes; what is longer is cut into several, so that a file without line ends takes no memory.
+const LONGEST_LINE: u64 = 4096;
+/// Reports that wait to be printed; when there are more, they are left out.
+const REPORT_QUEUE: usize = 1024;
+/// How long the end waits for reports that are still to be printed: a paused terminal does not hold it up.
+const LAST_REPORTS: Duration = Duration::from_millis(500);
+/// How often a terminal is looked at that belongs to another job now.
+const FOREGROUND_PERIOD_MS: u16 = 500;
 
 /// What `cangate sim detcon` is asked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -52,6 +65,15 @@ pub enum SimError {
         /// The last.
         last: u16,
     },
+    /// A bus inside this process, where nobody else can be.
+    #[error(
+        "`{interface}` is a bus inside this process: nobody else could ever be on it; simulate on an interface of the host, \
+         for example `-i vcan0`, or let `cangate demo` show a gateway and devices in one process"
+    )]
+    Alone {
+        /// As the user wrote it.
+        interface: String,
+    },
     /// The scenario is neither a name nor a file that can be read.
     #[error("scenario `{scenario}` cannot be read: {source}; give a file, or one of {}", names())]
     ReadScenario {
@@ -70,7 +92,7 @@ impl SimError {
     #[must_use]
     pub fn exit(&self) -> Exit {
         match self {
-            Self::NodeIds { .. } => Exit::Usage,
+            Self::NodeIds { .. } | Self::Alone { .. } => Exit::Usage,
             Self::ReadScenario { .. } => Exit::Io,
             Self::Scenario(_) => Exit::Configuration,
         }
@@ -98,8 +120,11 @@ pub(super) fn command(arguments: &SimArguments) -> Exit {
             print_error(&format!("signals cannot be handled: {error}"));
             return Exit::Io;
         }
-        let input = BufReader::new(std::io::stdin());
-        match run(options, input, std::io::stdout(), Clock::start(), stop).await {
+        let ended = async {
+            check_company(&options.interface)?;
+            run(options, orders(), io::stdout(), Clock::start(), stop).await
+        };
+        match ended.await {
             Ok(()) => Exit::Ok,
             Err(error) => {
                 print_error(&error.to_string());
@@ -107,6 +132,49 @@ pub(super) fn command(arguments: &SimArguments) -> Exit {
             }
         }
     })
+}
+
+/// A simulator is for somebody else on the bus.
+fn check_company(interface: &Interface) -> Result<(), SimError> {
+    match interface {
+        Interface::Virtual(_) => Err(SimError::Alone { interface: interface.to_string() }),
+        Interface::SocketCan(_) | Interface::Slcan { .. } | Interface::SlcanTcp { .. } => Ok(()),
+    }
+}
+
+/// The standard input, as the orders come in by it.
+fn orders() -> Box<dyn BufRead + Send> {
+    let input = io::stdin();
+    match input.as_fd().try_clone_to_owned() {
+        Ok(terminal) if input.is_terminal() => Box::new(BufReader::new(Terminal(File::from(terminal)))),
+        Ok(_) | Err(_) => Box::new(BufReader::new(input)),
+    }
+}
+
+/// A terminal that is read only while this job is in its foreground and something was typed: the system stops a job of the
+/// background that reads (`SIGTTIN`), and with it all its devices.
+struct Terminal(File);
+
+impl Terminal {
+    /// Whether this job is in the foreground; of a terminal without jobs, always.
+    fn is_ours(&self) -> bool {
+        !tcgetpgrp(&self.0).is_ok_and(|foreground| foreground != getpgrp())
+    }
+}
+
+impl Read for Terminal {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        loop {
+            if !self.is_ours() {
+                std::thread::sleep(Duration::from_millis(u64::from(FOREGROUND_PERIOD_MS)));
+                continue;
+            }
+            let mut waiting = [PollFd::new(self.0.as_fd(), PollFlags::POLLIN)];
+            if poll(&mut waiting, PollTimeout::from(FOREGROUND_PERIOD_MS))? > 0 && self.is_ours() {
+                return self.0.read(buffer);
+            }
+        }
+    }
 }
 
 /// The devices that are asked for. Reads the scenario's file.
@@ -135,11 +203,11 @@ fn scenario(name: &str) -> Result<Scenario, SimError> {
 
 /// Runs until `stop`. Orders come from `input`, line by line; what happens is told to `report`.
 ///
-/// `input` is read by a thread of its own that ends with it, or with the process.
+/// `input` and `report` have a thread of their own each; both end with their streams, or with the process.
 pub async fn run(
     options: SimOptions,
     input: impl BufRead + Send + 'static,
-    report: impl Write + Send,
+    report: impl Write + Send + 'static,
     clock: Clock,
     stop: CancellationToken,
 ) -> Result<(), SimError> {
@@ -147,25 +215,48 @@ pub async fn run(
     let (events_to_us, events) = mpsc::channel(EVENT_QUEUE);
     let (transmit, to_send) = mpsc::channel(TRANSMIT_QUEUE);
     let (lines_to_us, lines) = mpsc::channel(LINE_QUEUE);
+    let (reports, to_print) = mpsc::channel(REPORT_QUEUE);
+    let (printed_to_us, printed) = oneshot::channel();
+    std::thread::spawn(move || read_lines(input, &lines_to_us));
     std::thread::spawn(move || {
-        for line in input.lines() {
-            let Ok(line) = line else { return };
-            if lines_to_us.blocking_send(line).is_err() {
-                return;
-            }
-        }
+        print_reports(report, to_print);
+        // Nobody waits any more when the simulation was given up.
+        let _ = printed_to_us.send(());
     });
     let bus =
         can::task::run(BusIndex(0), options.interface, false, events_to_us, to_send, clock, stop.clone());
-    let devices = task::run(plans, BusEnd { events, transmit }, lines, report, clock, stop);
+    let devices = task::run(plans, BusEnd { events, transmit }, lines, reports, clock, stop);
     tokio::join!(bus, devices);
+    // What is not printed by now is not worth waiting for.
+    let _ = tokio::time::timeout(LAST_REPORTS, printed).await;
     Ok(())
+}
+
+/// Until the end of the input, or of the simulation. What is not UTF-8 becomes a line that nobody understands.
+fn read_lines(mut input: impl BufRead, lines: &mpsc::Sender<String>) {
+    let mut line = Vec::new();
+    loop {
+        line.clear();
+        match input.by_ref().take(LONGEST_LINE).read_until(b'\n', &mut line) {
+            Ok(0) | Err(_) => return,
+            Ok(_) => {}
+        }
+        if lines.blocking_send(String::from_utf8_lossy(&line).trim().to_owned()).is_err() {
+            return;
+        }
+    }
+}
+
+/// Until the simulation ends. Reports that cannot be written are no reason to stop.
+fn print_reports(mut to: impl Write, mut reports: mpsc::Receiver<String>) {
+    while let Some(text) = reports.blocking_recv() {
+        let _ = writeln!(to, "{text}").and_then(|()| to.flush());
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use std::io::Cursor;
-    use std::time::Duration;
 
     use super::*;
     use crate::can::virtual_bus;
@@ -234,5 +325,64 @@ mod tests {
         let error = with("unheard_of").unwrap_err();
         assert_eq!(error.exit(), Exit::Io);
         assert!(error.to_string().contains("knock_cylinder_7"), "{error}");
+    }
+
+    #[test]
+    fn a_bus_inside_the_process_is_refused_with_the_way_out() {
+        let error = check_company(&options().interface).unwrap_err();
+        assert_eq!(error.exit(), Exit::Usage);
+        assert!(
+            error.to_string().contains("-i vcan0") && error.to_string().contains("cangate demo"),
+            "{error}"
+        );
+        assert!(check_company(&"vcan0".parse().unwrap()).is_ok());
+    }
+
+    #[test]
+    fn a_byte_that_is_not_utf_8_does_not_end_the_orders() {
+        let (lines, mut read) = mpsc::channel(64);
+        let long = "x".repeat(10_000);
+        let text = [b"power off\nkn\xFFck\r\n", long.as_bytes(), b"\npower on"].concat();
+        read_lines(Cursor::new(text), &lines);
+        let read: Vec<String> = std::iter::from_fn(|| read.try_recv().ok()).collect();
+        assert_eq!((read[0].as_str(), read[1].as_str()), ("power off", "kn\u{FFFD}ck"));
+        assert!(read[2..].iter().all(|line| line.len() <= 4096));
+        assert_eq!(read.last().unwrap(), "power on");
+    }
+
+    /// A report that is never read: as a terminal that is paused with Ctrl-S.
+    struct Paused;
+
+    impl Write for Paused {
+        fn write(&mut self, _: &[u8]) -> std::io::Result<usize> {
+            loop {
+                std::thread::park();
+            }
+        }
+
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[tokio::test]
+    async fn a_report_that_is_never_read_stops_neither_the_devices_nor_the_end() {
+        let (clock, stop) = (Clock::start(), CancellationToken::new());
+        let (mut heard, mut say) = virtual_bus::join("cli-sim-paused", clock).split();
+        let options = SimOptions { interface: "virtual:cli-sim-paused".parse().unwrap(), ..options() };
+        let sim = tokio::spawn(run(options, Cursor::new(""), Paused, clock, stop.clone()));
+        let answered = async {
+            loop {
+                let BusEvent::Frame { frame, .. } = heard.recv().await.unwrap() else { continue };
+                if frame.to_string() == "701#00" {
+                    say.send(&"701#R1".parse().unwrap()).await.unwrap();
+                } else {
+                    return;
+                }
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(60), answered).await.unwrap();
+        stop.cancel();
+        tokio::time::timeout(Duration::from_secs(60), sim).await.unwrap().unwrap().unwrap();
     }
 }

@@ -1,13 +1,15 @@
 //! Puts simulated devices on a bus. \[IO\]
 
-use std::io::Write;
+use std::collections::VecDeque;
 
 use tokio::sync::mpsc;
+use tokio::sync::mpsc::error::TrySendError;
 use tokio::time::sleep_until;
 use tokio_util::sync::CancellationToken;
 
 use super::control::{HELP, Order};
 use super::device::{DevicePlan, SimulatedDevice, Status};
+use crate::can::outage::Repeats;
 use crate::can::{BusEvent, BusIndex, CanFrame};
 use crate::time::{Clock, Instant, Now};
 
@@ -20,21 +22,23 @@ pub struct BusEnd {
     pub transmit: mpsc::Sender<CanFrame>,
 }
 
+/// Orders that wait for the bus to come up. One more is refused.
+const LINES_IN_ADVANCE: usize = 64;
+
 /// Runs devices until `stop`, or until the bus task has ended. They are powered on when the bus is up for the first time.
 ///
-/// `lines` takes control lines ([`Order`], or `help`); its end does not end the simulation. `report` gets one line for
-/// each change of a device's [`Status`], each order and each change of the bus; when it cannot be written to, the
-/// simulation goes on without it.
+/// `lines` takes control lines ([`Order`], or `help`); its end does not end the simulation. Orders that come before the
+/// bus is up are carried out when it is. `report` gets one text for each change of a device's [`Status`], each order and
+/// each change of the bus; when it is full, texts are left out and counted, when it is closed the simulation goes on.
 pub async fn run(
     plans: Vec<DevicePlan>,
     mut bus: BusEnd,
     mut lines: mpsc::Receiver<String>,
-    report: impl Write + Send,
+    report: mpsc::Sender<String>,
     clock: Clock,
     stop: CancellationToken,
 ) {
-    let mut bench =
-        Bench { plans, devices: Vec::new(), transmit: bus.transmit, queue_full: false, bus_up: None, report };
+    let mut bench = Bench::new(plans, bus.transmit, report);
     let mut lines_open = true;
     loop {
         let now = clock.now();
@@ -46,7 +50,7 @@ pub async fn run(
                 Some((_, event)) => bench.handle_event(clock.now(), &event),
                 None => return,
             },
-            line = lines.recv(), if lines_open && bench.plans.is_empty() => match line {
+            line = lines.recv(), if lines_open => match line {
                 Some(line) => bench.handle_line(clock.now(), line.trim()),
                 None => lines_open = false,
             },
@@ -58,18 +62,62 @@ pub async fn run(
     }
 }
 
-struct Bench<W> {
+/// Texts for whoever watches. One that finds the queue full is left out: a reader who is slow, or a terminal that is
+/// paused, must not hold up the devices.
+struct Report {
+    queue: mpsc::Sender<String>,
+    left_out: u64,
+}
+
+impl Report {
+    fn say(&mut self, text: String) {
+        if self.left_out > 0 {
+            let gap = format!("({} lines were left out here: nobody read them in time)", self.left_out);
+            if self.queue.try_send(gap).is_ok() {
+                self.left_out = 0;
+            }
+        }
+        if matches!(self.queue.try_send(text), Err(TrySendError::Full(_))) {
+            self.left_out += 1;
+        }
+    }
+}
+
+struct Bench {
     /// Devices that wait for the bus.
     plans: Vec<DevicePlan>,
+    /// Orders that wait for the devices.
+    waiting: VecDeque<String>,
     /// Each with the status that was reported last.
     devices: Vec<(SimulatedDevice, Option<Status>)>,
     transmit: mpsc::Sender<CanFrame>,
-    queue_full: bool,
+    overloads: Repeats,
+    failures: Repeats,
     bus_up: Option<bool>,
-    report: W,
+    report: Report,
 }
 
-impl<W: Write> Bench<W> {
+impl Bench {
+    fn new(plans: Vec<DevicePlan>, transmit: mpsc::Sender<CanFrame>, report: mpsc::Sender<String>) -> Self {
+        let mut bench = Self {
+            plans,
+            waiting: VecDeque::new(),
+            devices: Vec::new(),
+            transmit,
+            overloads: Repeats::default(),
+            failures: Repeats::default(),
+            bus_up: None,
+            report: Report { queue: report, left_out: 0 },
+        };
+        let mut stories: Vec<String> =
+            bench.plans.iter().map(|plan| plan.scenario.description.clone()).collect();
+        stories.dedup();
+        for story in stories {
+            bench.report.say(format!("scenario: {story}"));
+        }
+        bench
+    }
+
     fn each(&mut self, mut act: impl FnMut(&mut SimulatedDevice)) {
         for (device, _) in &mut self.devices {
             act(device);
@@ -88,23 +136,45 @@ impl<W: Write> Bench<W> {
                     self.say(now, if link.is_up() { "bus: up" } else { "bus: down" });
                 }
                 if link.is_up() {
-                    let plans = std::mem::take(&mut self.plans);
-                    let devices = plans.iter().map(|plan| (SimulatedDevice::power_on(plan, now), None));
-                    self.devices.extend(devices);
+                    self.power_on(now);
                 }
             }
-            BusEvent::NotSent { .. } | BusEvent::Counters { .. } => {}
+            BusEvent::NotSent { .. } => {
+                if let Some(unsaid) = self.failures.admit(now.instant) {
+                    let text = "bus: a frame could not be sent: the bus is down, or nobody acknowledges";
+                    self.say(now, &counted(text, unsaid));
+                }
+            }
+            BusEvent::Counters { .. } => {}
+        }
+    }
+
+    /// The bus is up: powers on what has waited for it, and carries out what was ordered meanwhile.
+    fn power_on(&mut self, now: Now) {
+        for plan in std::mem::take(&mut self.plans) {
+            self.devices.push((SimulatedDevice::power_on(&plan, now), None));
+        }
+        for line in std::mem::take(&mut self.waiting) {
+            self.carry_out(now, &line);
         }
     }
 
     fn handle_line(&mut self, now: Now, line: &str) {
         match line {
             "" => {}
-            "help" => self.say_plain(HELP),
-            _ => match line.parse::<Order>() {
-                Ok(order) => self.obey(now, line, &order),
-                Err(error) => self.say_plain(&format!("error: {error}")),
-            },
+            "help" => self.report.say(HELP.to_owned()),
+            _ if self.plans.is_empty() => self.carry_out(now, line),
+            _ if self.waiting.len() < LINES_IN_ADVANCE => self.waiting.push_back(line.to_owned()),
+            _ => self.report.say(format!(
+                "error: `{line}`: {LINES_IN_ADVANCE} orders already wait for the bus to come up"
+            )),
+        }
+    }
+
+    fn carry_out(&mut self, now: Now, line: &str) {
+        match line.parse::<Order>() {
+            Ok(order) => self.obey(now, line, &order),
+            Err(error) => self.report.say(format!("error: {error}")),
         }
     }
 
@@ -119,18 +189,22 @@ impl<W: Write> Bench<W> {
         if found {
             self.say(now, &format!("ok: {line}"));
         } else {
-            self.say_plain(&format!("error: `{line}`: no such node is simulated here"));
+            self.report.say(format!("error: `{line}`: no such node is simulated here"));
         }
     }
 
     /// Sends what is to be sent and reports what has changed.
     fn settle(&mut self, now: Now) {
         while let Some(frame) = self.devices.iter_mut().find_map(|(device, _)| device.poll_output()) {
-            let full = self.transmit.try_send(frame).is_err();
-            if full && !self.queue_full {
-                self.say(now, "bus: overloaded, frames are lost");
+            match self.transmit.try_send(frame) {
+                // That the bus task has ended is told by its events.
+                Ok(()) | Err(TrySendError::Closed(_)) => {}
+                Err(TrySendError::Full(_)) => {
+                    if let Some(unsaid) = self.overloads.admit(now.instant) {
+                        self.say(now, &counted("bus: overloaded, a frame is lost", unsaid));
+                    }
+                }
             }
-            self.queue_full = full;
         }
         let mut changes = Vec::new();
         for (device, reported) in &mut self.devices {
@@ -146,18 +220,17 @@ impl<W: Write> Bench<W> {
 
     fn say(&mut self, now: Now, text: &str) {
         let (seconds, millis) = (now.instant.as_millis() / 1000, now.instant.as_millis() % 1000);
-        self.say_plain(&format!("{seconds}.{millis:03} {text}"));
+        self.report.say(format!("{seconds}.{millis:03} {text}"));
     }
+}
 
-    /// A report that nobody reads any more is no reason to stop.
-    fn say_plain(&mut self, text: &str) {
-        let _ = writeln!(self.report, "{text}").and_then(|()| self.report.flush());
-    }
+/// A message, and how many of its kind were not told since the last.
+fn counted(text: &str, unsaid: u64) -> String {
+    if unsaid == 0 { text.to_owned() } else { format!("{text} ({unsaid} more since this was last said)") }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::sync::{Arc, Mutex};
     use std::time::Duration;
 
     use super::super::scenario::Scenario;
@@ -165,25 +238,12 @@ mod tests {
     use crate::can::Link;
     use crate::canopen::NodeId;
 
-    #[derive(Clone, Default)]
-    struct Paper(Arc<Mutex<Vec<u8>>>);
-
-    impl Write for Paper {
-        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-            self.0.lock().unwrap().write(bytes)
-        }
-
-        fn flush(&mut self) -> std::io::Result<()> {
-            Ok(())
-        }
-    }
-
     /// Devices 1 to `count` on a bus of which the test holds the other end.
     struct Rig {
         events: mpsc::Sender<(BusIndex, BusEvent)>,
         sent: mpsc::Receiver<CanFrame>,
         lines: mpsc::Sender<String>,
-        paper: Paper,
+        paper: mpsc::Receiver<String>,
         clock: Clock,
         stop: CancellationToken,
         task: tokio::task::JoinHandle<()>,
@@ -203,15 +263,21 @@ mod tests {
         }
 
         fn waiting(count: u8, queue: usize) -> Self {
+            Self::with_reports(count, queue, 1000)
+        }
+
+        /// With a reader that lets so many reports wait.
+        fn with_reports(count: u8, queue: usize, reports: usize) -> Self {
+            let (report, paper) = mpsc::channel(reports);
             let (events, events_end) = mpsc::channel(16);
             let (transmit, sent) = mpsc::channel(queue);
             let (lines, lines_end) = mpsc::channel(16);
-            let (clock, stop, paper) = (Clock::start(), CancellationToken::new(), Paper::default());
+            let (clock, stop) = (Clock::start(), CancellationToken::new());
             let plan =
                 |node| DevicePlan::new(NodeId::new(node).unwrap(), Scenario::shipped("quiet").unwrap());
             let plans = (1..=count).map(plan).collect();
             let end = BusEnd { events: events_end, transmit };
-            let task = tokio::spawn(run(plans, end, lines_end, paper.clone(), clock, stop.clone()));
+            let task = tokio::spawn(run(plans, end, lines_end, report, clock, stop.clone()));
             Self { events, sent, lines, paper, clock, stop, task }
         }
 
@@ -228,8 +294,13 @@ mod tests {
             std::iter::from_fn(|| self.sent.try_recv().ok()).map(|frame| frame.to_string()).collect()
         }
 
-        fn report(&self) -> String {
-            String::from_utf8(std::mem::take(&mut *self.paper.0.lock().unwrap())).unwrap()
+        fn report(&mut self) -> String {
+            std::iter::from_fn(|| self.paper.try_recv().ok()).map(|text| text + "\n").collect()
+        }
+
+        async fn not_sent(&self) {
+            let event = BusEvent::NotSent { frame: "701#00".parse().unwrap(), at: self.clock.now() };
+            self.events.send((BusIndex(0), event)).await.unwrap();
         }
     }
 
@@ -306,7 +377,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn the_state_of_the_bus_is_reported_when_it_changes() {
-        let rig = Rig::start(1, 64).await;
+        let mut rig = Rig::start(1, 64).await;
         for link in [Link::ErrorPassive, Link::Down, Link::Absent] {
             rig.link(link).await;
         }
@@ -330,5 +401,94 @@ mod tests {
         rig.link(Link::ErrorActive).await;
         pass(10).await;
         assert!(rig.frames().is_empty());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_queue_that_is_full_again_and_again_is_told_once_in_a_while_and_counted() {
+        let mut rig = Rig::start(4, 2).await;
+        pass(1).await;
+        rig.report();
+        for _ in 0..5 {
+            rig.frames();
+            rig.line("power off").await;
+            rig.line("power on").await;
+            pass(100).await;
+        }
+        assert_eq!(rig.report().matches("overloaded").count(), 0, "it was said a moment ago");
+        pass(10_000).await;
+        rig.line("power off").await;
+        rig.line("power on").await;
+        pass(100).await;
+        let report = rig.report();
+        assert!(
+            report.contains("overloaded, a frame is lost (11 more since this was last said)"),
+            "{report}"
+        );
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn frames_that_could_not_be_sent_are_told_and_counted() {
+        let mut rig = Rig::start(1, 64).await;
+        for _ in 0..3 {
+            rig.not_sent().await;
+        }
+        pass(10_000).await;
+        rig.not_sent().await;
+        pass(1).await;
+        let report = rig.report();
+        assert_eq!(report.matches("could not be sent").count(), 2, "{report}");
+        assert!(report.contains("nobody acknowledges (2 more since this was last said)"), "{report}");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_bus_task_that_has_ended_is_not_an_overload() {
+        let mut rig = Rig::start(1, 64).await;
+        let (_, closed) = mpsc::channel(1);
+        drop(std::mem::replace(&mut rig.sent, closed));
+        pass(1000).await;
+        assert!(!rig.report().contains("overloaded"));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_report_that_nobody_reads_does_not_stop_the_devices_and_its_gap_is_told() {
+        let mut rig = Rig::with_reports(1, 64, 4);
+        rig.link(Link::ErrorActive).await;
+        for _ in 0..10 {
+            rig.line("knock 7 on").await;
+            pass(10).await;
+        }
+        pass(200).await;
+        rig.frame("000#0101").await;
+        pass(1000).await;
+        assert!(rig.frames().iter().any(|frame| frame.starts_with("181#")));
+        rig.report();
+        rig.line("knock 7 off").await;
+        pass(10).await;
+        let report = rig.report();
+        assert!(report.starts_with('(') && report.contains("lines were left out here"), "{report}");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn help_is_given_before_the_bus_is_up_and_so_is_the_scenario() {
+        let mut rig = Rig::waiting(2, 64);
+        rig.link(Link::Absent).await;
+        rig.line("help").await;
+        pass(10).await;
+        let report = rig.report();
+        assert!(report.contains("mute guarding on|off"), "{report}");
+        assert_eq!(report.matches("scenario: ").count(), 1, "{report}");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn orders_without_a_bus_are_bounded() {
+        let mut rig = Rig::waiting(1, 64);
+        for _ in 0..=LINES_IN_ADVANCE {
+            rig.line("power on").await;
+        }
+        pass(10).await;
+        assert_eq!(rig.report().matches("already wait for the bus").count(), 1);
+        rig.link(Link::ErrorActive).await;
+        pass(10).await;
+        assert_eq!(rig.report().matches("ok: power on").count(), LINES_IN_ADVANCE);
     }
 }
