@@ -16,9 +16,8 @@ use super::output::{block_on, print_error};
 use crate::can::interface::Interface;
 use crate::can::{self, BusIndex};
 use crate::canopen::NodeId;
-use crate::simulator::scenario::{SHIPPED, Scenario};
 use crate::simulator::task::{self, BusEnd};
-use crate::simulator::{DevicePlan, SimulatorError};
+use crate::simulator::{DevicePlan, Kind, Scenario, SimulatorError};
 use crate::supervisor::shutdown;
 use crate::time::Clock;
 
@@ -37,9 +36,11 @@ const LAST_REPORTS: Duration = Duration::from_millis(500);
 /// How often a terminal is looked at that belongs to another job now.
 const FOREGROUND_PERIOD_MS: u16 = 500;
 
-/// What `cangate sim detcon` is asked for.
+/// What `cangate sim` is asked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SimOptions {
+    /// The device.
+    pub kind: Kind,
     /// The bus.
     pub interface: Interface,
     /// Node id of the first device.
@@ -75,8 +76,10 @@ pub enum SimError {
         interface: String,
     },
     /// The scenario is neither a name nor a file that can be read.
-    #[error("scenario `{scenario}` cannot be read: {source}; give a file, or one of {}", names())]
+    #[error("scenario `{scenario}` cannot be read: {source}; give a file, or one of {}", names(*kind))]
     ReadScenario {
+        /// The device, which has scenarios of its own.
+        kind: Kind,
         /// As the user wrote it.
         scenario: String,
         /// What the system says.
@@ -99,15 +102,18 @@ impl SimError {
     }
 }
 
-fn names() -> String {
-    SHIPPED.map(|(name, _)| name).join(", ")
+fn names(kind: Kind) -> String {
+    kind.shipped().iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ")
 }
 
 /// Runs until a signal, with orders from the standard input.
 pub(super) fn command(arguments: &SimArguments) -> Exit {
-    let SimDevice::Detcon = arguments.device;
+    let kind = match arguments.device {
+        SimDevice::Detcon => Kind::Detcon,
+    };
     let Some(node) = NodeId::new(arguments.node) else { return Exit::Usage };
     let options = SimOptions {
+        kind,
         interface: arguments.interface.clone(),
         node,
         count: arguments.count,
@@ -179,7 +185,7 @@ impl Read for Terminal {
 
 /// The devices that are asked for. Reads the scenario's file.
 pub fn plan(options: &SimOptions) -> Result<Vec<DevicePlan>, SimError> {
-    let scenario = scenario(options.scenario.as_deref().unwrap_or("quiet"))?;
+    let scenario = scenario(options.kind, options.scenario.as_deref().unwrap_or("quiet"))?;
     let count = options.count.max(1);
     (0..count)
         .map(|place| {
@@ -192,13 +198,16 @@ pub fn plan(options: &SimOptions) -> Result<Vec<DevicePlan>, SimError> {
         .collect()
 }
 
-fn scenario(name: &str) -> Result<Scenario, SimError> {
-    if let Some(shipped) = Scenario::shipped(name) {
+fn scenario(kind: Kind, name: &str) -> Result<Scenario, SimError> {
+    if let Some(shipped) = Scenario::shipped(kind, name) {
         return Ok(shipped);
     }
-    let text = std::fs::read_to_string(name)
-        .map_err(|source| SimError::ReadScenario { scenario: name.to_owned(), source })?;
-    Ok(Scenario::parse(name, &text)?)
+    let text = std::fs::read_to_string(name).map_err(|source| SimError::ReadScenario {
+        kind,
+        scenario: name.to_owned(),
+        source,
+    })?;
+    Ok(Scenario::parse(kind, name, &text)?)
 }
 
 /// Runs until `stop`. Orders come from `input`, line by line; what happens is told to `report`.
@@ -264,6 +273,7 @@ mod tests {
 
     fn options() -> SimOptions {
         SimOptions {
+            kind: Kind::Detcon,
             interface: "virtual:cli-sim-test".parse().unwrap(),
             node: NodeId::new(1).unwrap(),
             count: 1,

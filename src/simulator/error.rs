@@ -8,8 +8,8 @@ pub enum SimulatorError {
     /// A scenario file has these problems, in the order of the file.
     #[error("{}", lines(.0))]
     Scenario(Vec<Problem>),
-    /// A control line is not understood.
-    #[error("`{line}` is not understood: {reason}")]
+    /// A control line is not understood, or would do nothing.
+    #[error("`{line}` is not done: {reason}")]
     Control {
         /// The line.
         line: String,

@@ -4,19 +4,16 @@
 
 use std::time::Duration;
 
-use super::control::Control;
-use super::detcon::DetconSettings;
+use super::kind::{Kind, Settings};
 use crate::time::Instant;
 
 /// A device and its story.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Scenario {
     /// One sentence.
     pub description: String,
-    /// Cylinders of the engine, 0..=20.
-    pub cylinders: u8,
     /// What the device is like.
-    pub settings: DetconSettings,
+    pub settings: Settings,
     /// What happens.
     pub events: Vec<Event>,
 }
@@ -28,35 +25,23 @@ pub struct Event {
     pub at: Duration,
     /// And again after this long; never zero.
     pub every: Option<Duration>,
-    /// What.
-    pub control: Control,
+    /// What is ordered then, in the words of the control line.
+    pub order: String,
 }
 
-/// Scenarios that come with the program: name and text.
-pub const SHIPPED: [(&str, &str); 11] = [
-    ("quiet", include_str!("scenarios/quiet.toml")),
-    ("knock_cylinder_7", include_str!("scenarios/knock_cylinder_7.toml")),
-    ("trip", include_str!("scenarios/trip.toml")),
-    ("bad_sensor", include_str!("scenarios/bad_sensor.toml")),
-    ("power_cycle", include_str!("scenarios/power_cycle.toml")),
-    ("mute_guarding", include_str!("scenarios/mute_guarding.toml")),
-    ("mute_pdos", include_str!("scenarios/mute_pdos.toml")),
-    ("stuck_toggle", include_str!("scenarios/stuck_toggle.toml")),
-    ("wrong_length", include_str!("scenarios/wrong_length.toml")),
-    ("second_master", include_str!("scenarios/second_master.toml")),
-    ("demo", include_str!("scenarios/demo.toml")),
-];
+/// A scenario that comes with the program: name and text.
+pub type Shipped = (&'static str, &'static str);
 
 impl Scenario {
     /// A scenario that comes with the program, by its name; `None` when there is none of that name.
     #[must_use]
-    pub fn shipped(name: &str) -> Option<Self> {
-        let (name, text) = SHIPPED.iter().find(|(shipped, _)| *shipped == name)?;
-        Self::parse(&format!("{name}.toml"), text).ok()
+    pub fn shipped(kind: Kind, name: &str) -> Option<Self> {
+        let (name, text) = kind.shipped().iter().find(|(shipped, _)| *shipped == name)?;
+        Self::parse(kind, &format!("{name}.toml"), text).ok()
     }
 }
 
-/// Tells a story: gives each control when it is due.
+/// Tells a story: gives each order when it is due.
 #[derive(Clone, Debug, Default)]
 pub struct Player {
     pending: Vec<Pending>,
@@ -66,7 +51,7 @@ pub struct Player {
 struct Pending {
     next: Instant,
     every: Option<Duration>,
-    control: Control,
+    order: String,
 }
 
 impl Player {
@@ -76,12 +61,12 @@ impl Player {
         let pending = |event: &Event| Pending {
             next: start + event.at,
             every: event.every.filter(|every| !every.is_zero()),
-            control: event.control,
+            order: event.order.clone(),
         };
         Self { pending: scenario.events.iter().map(pending).collect() }
     }
 
-    /// When the next control is due.
+    /// When the next order is due.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         self.pending.iter().map(|pending| pending.next).min()
@@ -89,21 +74,38 @@ impl Player {
 
     /// What is due, in the order of time and, at the same time, of the file; call until `None`. Repetitions that a late
     /// call has missed are left out.
-    pub fn poll(&mut self, now: Instant) -> Option<Control> {
+    pub fn poll(&mut self, now: Instant) -> Option<String> {
         let due = self.pending.iter().enumerate().filter(|(_, pending)| pending.next <= now);
         let (at, _) = due.min_by_key(|(_, pending)| pending.next)?;
         let pending = self.pending.get_mut(at)?;
-        let control = pending.control;
-        if let Some(every) = pending.every {
-            let missed = now.since(pending.next).as_micros() / every.as_micros().max(1);
-            pending.next = pending.next + every * u32::try_from(missed + 1).unwrap_or(u32::MAX);
-        } else {
-            self.pending.remove(at);
-        }
-        Some(control)
+        let Some(every) = pending.every else { return Some(self.pending.remove(at).order) };
+        let missed = now.since(pending.next).as_micros() / every.as_micros().max(1);
+        pending.next = pending.next + every * u32::try_from(missed + 1).unwrap_or(u32::MAX);
+        Some(pending.order.clone())
     }
 }
 
 #[cfg(test)]
-#[path = "scenario_tests.rs"]
-mod tests;
+mod tests {
+    use super::*;
+    use crate::simulator::detcon::DetconSettings;
+
+    #[test]
+    fn a_story_that_is_told_late_leaves_repetitions_out() {
+        let event = |at, order: &str| Event {
+            at: Duration::from_millis(at),
+            every: Some(Duration::from_millis(1000)),
+            order: order.to_owned(),
+        };
+        let scenario = Scenario {
+            description: String::new(),
+            settings: Settings::Detcon(DetconSettings::default()),
+            events: vec![event(200, "power on"), event(100, "power off")],
+        };
+        let mut player = Player::new(&scenario, Instant::START);
+        assert_eq!(player.poll_timeout(), Some(Instant::from_millis(100)));
+        let told: Vec<_> = std::iter::from_fn(|| player.poll(Instant::from_millis(5150))).collect();
+        assert_eq!(told, ["power off", "power on"]);
+        assert_eq!(player.poll_timeout(), Some(Instant::from_millis(5200)));
+    }
+}

@@ -7,8 +7,9 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::time::sleep_until;
 use tokio_util::sync::CancellationToken;
 
-use super::control::{HELP, Order};
-use super::device::{DevicePlan, SimulatedDevice, Status};
+use super::device::{Device, DevicePlan, Status};
+use super::kind::Kind;
+use super::order::{self, Order};
 use crate::can::outage::Repeats;
 use crate::can::{BusEvent, BusIndex, CanFrame};
 use crate::time::{Clock, Instant, Now};
@@ -88,8 +89,10 @@ struct Bench {
     plans: Vec<DevicePlan>,
     /// Orders that wait for the devices.
     waiting: VecDeque<String>,
+    /// What can be ordered of all of them.
+    help: String,
     /// Each with the status that was reported last.
-    devices: Vec<(SimulatedDevice, Option<Status>)>,
+    devices: Vec<(Box<dyn Device>, Option<Status>)>,
     transmit: mpsc::Sender<CanFrame>,
     overloads: Repeats,
     failures: Repeats,
@@ -99,8 +102,12 @@ struct Bench {
 
 impl Bench {
     fn new(plans: Vec<DevicePlan>, transmit: mpsc::Sender<CanFrame>, report: mpsc::Sender<String>) -> Self {
+        let mut kinds: Vec<_> = plans.iter().map(|plan| plan.scenario.settings.kind()).collect();
+        kinds.sort();
+        kinds.dedup();
         let mut bench = Self {
             plans,
+            help: kinds.into_iter().map(Kind::help).collect::<Vec<_>>().join("\n\n"),
             waiting: VecDeque::new(),
             devices: Vec::new(),
             transmit,
@@ -118,9 +125,9 @@ impl Bench {
         bench
     }
 
-    fn each(&mut self, mut act: impl FnMut(&mut SimulatedDevice)) {
+    fn each(&mut self, mut act: impl FnMut(&mut dyn Device)) {
         for (device, _) in &mut self.devices {
-            act(device);
+            act(device.as_mut());
         }
     }
 
@@ -130,7 +137,11 @@ impl Bench {
 
     fn handle_event(&mut self, now: Now, event: &BusEvent) {
         match event {
-            BusEvent::Frame { frame, .. } => self.each(|device| device.handle_frame(now, frame)),
+            BusEvent::Frame { frame, .. } => self.each(|device| {
+                if device.hears(frame.id()) {
+                    device.handle_frame(now, frame);
+                }
+            }),
             BusEvent::Link { link, .. } => {
                 if self.bus_up.replace(link.is_up()) != Some(link.is_up()) {
                     self.say(now, if link.is_up() { "bus: up" } else { "bus: down" });
@@ -152,7 +163,7 @@ impl Bench {
     /// The bus is up: powers on what has waited for it, and carries out what was ordered meanwhile.
     fn power_on(&mut self, now: Now) {
         for plan in std::mem::take(&mut self.plans) {
-            self.devices.push((SimulatedDevice::power_on(&plan, now), None));
+            self.devices.push((plan.power_on(now), None));
         }
         for line in std::mem::take(&mut self.waiting) {
             self.carry_out(now, &line);
@@ -162,7 +173,7 @@ impl Bench {
     fn handle_line(&mut self, now: Now, line: &str) {
         match line {
             "" => {}
-            "help" => self.report.say(HELP.to_owned()),
+            "help" => self.report.say(self.help.clone()),
             _ if self.plans.is_empty() => self.carry_out(now, line),
             _ if self.waiting.len() < LINES_IN_ADVANCE => self.waiting.push_back(line.to_owned()),
             _ => self.report.say(format!(
@@ -179,17 +190,20 @@ impl Bench {
     }
 
     fn obey(&mut self, now: Now, line: &str, order: &Order) {
-        let mut found = false;
+        let words = order.words();
+        let (mut obeyed, mut refusal) = (false, None);
         self.each(|device| {
             if order.node.is_none_or(|node| node == device.node()) {
-                found = true;
-                device.handle_control(now, order.control);
+                match device.handle_line(now, &words) {
+                    Ok(()) => obeyed = true,
+                    Err(reason) => refusal = Some(reason),
+                }
             }
         });
-        if found {
-            self.say(now, &format!("ok: {line}"));
-        } else {
-            self.report.say(format!("error: `{line}`: no such node is simulated here"));
+        match refusal {
+            Some(reason) => self.report.say(format!("error: {}", order::refused(line, reason))),
+            None if obeyed => self.say(now, &format!("ok: {line}")),
+            None => self.report.say(format!("error: `{line}`: no such node is simulated here")),
         }
     }
 
@@ -209,8 +223,9 @@ impl Bench {
         let mut changes = Vec::new();
         for (device, reported) in &mut self.devices {
             let status = device.status();
-            if reported.replace(status) != Some(status) {
+            if reported.as_ref() != Some(&status) {
                 changes.push(format!("node {}: {status}", device.node()));
+                *reported = Some(status);
             }
         }
         for change in changes {
@@ -273,8 +288,10 @@ mod tests {
             let (transmit, sent) = mpsc::channel(queue);
             let (lines, lines_end) = mpsc::channel(16);
             let (clock, stop) = (Clock::start(), CancellationToken::new());
-            let plan =
-                |node| DevicePlan::new(NodeId::new(node).unwrap(), Scenario::shipped("quiet").unwrap());
+            let plan = |node| {
+                let scenario = Scenario::shipped(Kind::Detcon, "quiet").unwrap();
+                DevicePlan::new(NodeId::new(node).unwrap(), scenario)
+            };
             let plans = (1..=count).map(plan).collect();
             let end = BusEnd { events: events_end, transmit };
             let task = tokio::spawn(run(plans, end, lines_end, report, clock, stop.clone()));
@@ -340,7 +357,7 @@ mod tests {
             "node 2: off, knocking\n",
             "node 1: initialising, knocking\n",
             "error: `node 9 trip`: no such node",
-            "error: `nonsense` is not understood: type `help`",
+            "error: `nonsense` is not done: type `help`",
             "mute guarding on|off",
         ] {
             assert!(report.contains(line), "{line}\n---\n{report}");

@@ -10,7 +10,7 @@ use cangate::gateway::{Gateway, Input, Output};
 use cangate::mapping::{Sketch, Source, TagTable};
 use cangate::process_image::{NodeIndex, NodeStatus, ProcessImage, Quality, Sample};
 use cangate::simulator::random::Random;
-use cangate::simulator::{Control, DevicePlan, Order, Scenario, SimulatedDevice};
+use cangate::simulator::{Device, DevicePlan, Kind, Order, Scenario};
 use cangate::time::{Instant, Now, Timestamp};
 
 const BUS: BusIndex = BusIndex(0);
@@ -53,7 +53,7 @@ pub struct World {
     pub image: ProcessImage,
     pub weather: Weather,
     gateway: Option<Gateway>,
-    devices: Vec<SimulatedDevice>,
+    devices: Vec<Box<dyn Device>>,
     in_flight: BTreeMap<(Instant, u64), (Sender, CanFrame)>,
     sequence: u64,
     last_arrival: Instant,
@@ -119,25 +119,26 @@ impl World {
         self.settle();
     }
 
-    /// A device is connected and powered on now, with a shipped scenario.
+    /// A `DetCon` is connected and powered on now, with a shipped scenario.
     pub fn power_on(&mut self, id: u8, scenario: &str) {
-        let scenario = Scenario::shipped(scenario).unwrap();
-        let plan = DevicePlan::new(NodeId::new(id).unwrap(), scenario);
-        self.devices.push(SimulatedDevice::power_on(&plan, self.now()));
+        let scenario = Scenario::shipped(Kind::Detcon, scenario).unwrap();
+        self.connect(&DevicePlan::new(NodeId::new(id).unwrap(), scenario));
+    }
+
+    /// A device of any kind is connected and powered on now.
+    pub fn connect(&mut self, plan: &DevicePlan) {
+        self.devices.push(plan.power_on(self.now()));
         self.settle();
     }
 
     /// An order to one device (`node 2 power off`) or to all.
+    #[track_caller]
     pub fn order(&mut self, line: &str) {
-        let Order { node, control } = line.parse().unwrap();
-        self.control(node, control);
-    }
-
-    fn control(&mut self, node: Option<NodeId>, control: Control) {
+        let order: Order = line.parse().unwrap();
         let now = self.now();
         for device in &mut self.devices {
-            if node.is_none_or(|node| node == device.node()) {
-                device.handle_control(now, control);
+            if order.node.is_none_or(|node| node == device.node()) {
+                device.handle_line(now, &order.words()).unwrap();
             }
         }
         self.settle();
@@ -169,7 +170,7 @@ impl World {
     }
 
     fn next_due(&self) -> Option<Instant> {
-        let devices = self.devices.iter().filter_map(SimulatedDevice::poll_timeout);
+        let devices = self.devices.iter().filter_map(|device| device.poll_timeout());
         let gateway = self.gateway.iter().filter_map(|gateway| Some(gateway.poll_timeout()?.0));
         devices.chain(gateway).chain(self.in_flight.keys().next().map(|(due, _)| *due)).min()
     }
@@ -193,13 +194,11 @@ impl World {
         self.settle();
     }
 
-    /// Devices listen to NMT commands and to remote frames only.
+    /// Everybody but the sender sees a frame.
     fn deliver(&mut self, now: Now, sender: Sender, frame: CanFrame) {
-        if frame.is_remote() || frame.id().raw() == 0 {
-            for (place, device) in self.devices.iter_mut().enumerate() {
-                if sender != Sender::Device(place) {
-                    device.handle_frame(now, &frame);
-                }
+        for (place, device) in self.devices.iter_mut().enumerate() {
+            if sender != Sender::Device(place) && device.hears(frame.id()) {
+                device.handle_frame(now, &frame);
             }
         }
         if let (Some(gateway), Sender::Device(_)) = (&mut self.gateway, sender) {

@@ -1,12 +1,13 @@
-//! What can be ordered of a running device, by a scenario or by a line of text.
+//! What can be ordered of a running `DetCon`, by a scenario or by a line of text. Pure.
 
 use std::fmt;
-use std::str::FromStr;
 use std::time::Duration;
 
-use super::error::SimulatorError;
+use super::super::order::{millis, number, switch, switched_off, unknown, unless_off};
+use super::super::slave::SlaveOrder;
+use super::cadence::INHIBIT_TIME;
+use super::protocol::DetconSettings;
 use super::values::{Channel, StatusBit, Tpdo, Values};
-use crate::canopen::NodeId;
 
 /// Raw intensity of a knocking cylinder unless told: 63 %, between the two limits.
 pub const KNOCK_LEVEL: u8 = 160;
@@ -16,8 +17,8 @@ pub const TRIP_PULSE: Duration = Duration::from_millis(100);
 /// An order to a device. Faults and values stay as ordered until ordered otherwise.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Control {
-    /// Switches the power.
-    Power(bool),
+    /// What every slave understands.
+    Slave(SlaveOrder),
     /// Guard requests are not answered.
     MuteGuarding(bool),
     /// A TPDO is not sent; all of them when `None`.
@@ -26,23 +27,15 @@ pub enum Control {
     StuckToggle(bool),
     /// A TPDO has a wrong length, 0..=8, or its own again.
     WrongLength(Tpdo, Option<u8>),
-    /// Another master interferes.
-    SecondMaster(bool),
-    /// Another device has the same node id.
-    Duplicate(bool),
     /// Guard replies come this late.
     LateReplies(Option<Duration>),
     /// Reserved bits are set.
     ReservedBits(bool),
-    /// The device restarts again and again, this long after each start.
-    BootLoop(Option<Duration>),
-    /// NMT start has no effect.
-    RefuseStart(bool),
     /// A cylinder knocks with this raw intensity.
     Knock(Channel, Option<u8>),
     /// A sensor is bad.
     SensorBad(Channel, bool),
-    /// The engine is tripped; the trip bit is set this long.
+    /// The engine is tripped; the trip bit is set this long, at least [`INHIBIT_TIME`].
     Trip(Duration),
     /// A value has this raw content, whatever the engine does.
     Set(Point, u8),
@@ -130,21 +123,11 @@ impl fmt::Display for Point {
     }
 }
 
-/// A control line: `knock 7 on`, or `node 2 knock 7 on` for one of several devices.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Order {
-    /// Which device; all when `None`.
-    pub node: Option<NodeId>,
-    /// What it is to do.
-    pub control: Control,
-}
-
-/// What the line protocol understands, for people.
+/// What the line protocol understands besides what every slave does, for people.
 pub const HELP: &str = "\
-power on|off                  supply of the device
 knock CHANNEL on|off|LEVEL    a cylinder knocks (LEVEL raw, 0 to 255)
 sensor CHANNEL bad|good       a sensor is reported bad
-trip [MS]                     trip pulse; the engine stops and starts again after 10 s
+trip [MS]                     trip pulse of at least 100 ms; the engine stops and starts again after 10 s
 set NAME RAW                  a value, whatever the engine does: set trip 1, set knock_intensity_3 200
 clear NAME                    the value is the engine's again
 clear all                     no fault, no knock, no value set
@@ -154,32 +137,44 @@ mute pdo N on|off             TPDO N is not sent
 stuck toggle on|off           the toggle bit no longer changes
 wrong length PDO DLC|off      TPDO with DLC bytes (0 to 8)
 late replies MS|off           guard replies come so much later
-second master on|off          another master guards and stops the device
-duplicate on|off              another device with the same node id
-reserved bits on|off          reserved bits are set
-refuse start on|off           NMT start has no effect
-boot loop MS|off              the device restarts again and again
-node N LINE                   LINE for one of several devices
-help                          this text";
+reserved bits on|off          reserved bits are set";
 
-impl FromStr for Order {
-    type Err = SimulatorError;
+/// The order in a line, if a device that is like this takes it: what would do nothing is refused with the reason.
+pub fn check(settings: &DetconSettings, words: &[&str]) -> Result<Control, String> {
+    let control = parse(words)?;
+    match control {
+        Control::Knock(channel, _) | Control::SensorBad(channel, _) if channel.get() > settings.cylinders => {
+            let cylinders = settings.cylinders;
+            Err(format!(
+                "the engine has {cylinders} cylinders; give a channel up to that, or set `cylinders` in a scenario"
+            ))
+        }
+        Control::Trip(pulse) if pulse < INHIBIT_TIME => {
+            let shortest = INHIBIT_TIME.as_millis();
+            Err(format!(
+                "a trip pulse of {} ms can begin and end between two TPDO3; give at least {shortest}",
+                pulse.as_millis()
+            ))
+        }
+        control => Ok(control),
+    }
+}
 
-    fn from_str(line: &str) -> Result<Self, SimulatorError> {
-        let words: Vec<&str> = line.split_whitespace().collect();
-        let parsed = match words.as_slice() {
-            ["node", number, rest @ ..] => parse_node(number).and_then(|node| Ok((Some(node), parse(rest)?))),
-            all => parse(all).map(|control| (None, control)),
-        };
-        let (node, control) =
-            parsed.map_err(|reason| SimulatorError::Control { line: line.trim().to_owned(), reason })?;
-        Ok(Self { node, control })
+/// The order that ends another; `None` where it does not last.
+pub fn undo(words: &[&str]) -> Option<String> {
+    match words {
+        ["trip", ..] | ["clear", ..] => None,
+        ["sensor", channel, "bad"] => Some(format!("sensor {channel} good")),
+        ["set", name, _] => Some(format!("clear {name}")),
+        others => switched_off(others),
     }
 }
 
 fn parse(words: &[&str]) -> Result<Control, String> {
+    if let Some(order) = SlaveOrder::parse(words) {
+        return order.map(Control::Slave);
+    }
     Ok(match words {
-        ["power", to] => Control::Power(switch(to)?),
         ["mute", "guarding", to] => Control::MuteGuarding(switch(to)?),
         ["mute", "pdos", to] => Control::MutePdo(None, switch(to)?),
         ["mute", "pdo", pdo, to] => Control::MutePdo(Some(parse_tpdo(pdo)?), switch(to)?),
@@ -187,12 +182,8 @@ fn parse(words: &[&str]) -> Result<Control, String> {
         ["wrong", "length", pdo, dlc] => {
             Control::WrongLength(parse_tpdo(pdo)?, unless_off(dlc, |dlc| number(dlc, "a DLC", 0, 8))?)
         }
-        ["second", "master", to] => Control::SecondMaster(switch(to)?),
-        ["duplicate", to] => Control::Duplicate(switch(to)?),
         ["late", "replies", delay] => Control::LateReplies(unless_off(delay, millis)?),
         ["reserved", "bits", to] => Control::ReservedBits(switch(to)?),
-        ["boot", "loop", interval] => Control::BootLoop(unless_off(interval, millis)?),
-        ["refuse", "start", to] => Control::RefuseStart(switch(to)?),
         ["knock", channel, "on"] => Control::Knock(parse_channel(channel)?, Some(KNOCK_LEVEL)),
         ["knock", channel, level] => Control::Knock(
             parse_channel(channel)?,
@@ -205,35 +196,8 @@ fn parse(words: &[&str]) -> Result<Control, String> {
         ["set", name, raw] => Control::Set(Point::parse(name)?, number(raw, "a raw value", 0, 255)?),
         ["clear", "all"] => Control::ClearAll,
         ["clear", name] => Control::Clear(Point::parse(name)?),
-        _ => return Err("type `help` for what can be ordered".to_owned()),
+        _ => return Err(unknown()),
     })
-}
-
-fn switch(word: &str) -> Result<bool, String> {
-    match word {
-        "on" => Ok(true),
-        "off" => Ok(false),
-        other => Err(format!("`{other}` is neither `on` nor `off`")),
-    }
-}
-
-fn unless_off<T>(word: &str, parse: impl FnOnce(&str) -> Result<T, String>) -> Result<Option<T>, String> {
-    if word == "off" { Ok(None) } else { parse(word).map(Some) }
-}
-
-fn number(word: &str, what: &str, low: u8, high: u8) -> Result<u8, String> {
-    let number = word.parse().ok().filter(|number| (low..=high).contains(number));
-    number.ok_or_else(|| format!("`{word}` is not {what}; give a number from {low} to {high}"))
-}
-
-fn millis(word: &str) -> Result<Duration, String> {
-    let millis = word.parse().map(|millis: u32| Duration::from_millis(u64::from(millis)));
-    millis.map_err(|_| format!("`{word}` is not a time; give milliseconds, for example 150"))
-}
-
-fn parse_node(word: &str) -> Result<NodeId, String> {
-    let id = word.parse().ok().and_then(NodeId::new);
-    id.ok_or_else(|| format!("`{word}` is not a node id; give a number from 1 to 127"))
 }
 
 fn parse_tpdo(word: &str) -> Result<Tpdo, String> {
@@ -248,17 +212,26 @@ fn parse_channel(word: &str) -> Result<Channel, String> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::super::order::Order;
+    use super::super::super::slave;
     use super::*;
+    use crate::canopen::NodeId;
+
+    fn control(line: &str) -> Result<Control, String> {
+        let order: Order =
+            line.parse().map_err(|error: crate::simulator::SimulatorError| error.to_string())?;
+        check(&DetconSettings { cylinders: 20, ..DetconSettings::default() }, &order.words())
+    }
 
     fn order(line: &str) -> Control {
-        line.parse::<Order>().unwrap().control
+        control(line).unwrap()
     }
 
     #[test]
     fn every_line_of_the_help_is_understood() {
         let seven = Channel::new(7).unwrap();
         for (line, control) in [
-            ("power off", Control::Power(false)),
+            ("power off", Control::Slave(SlaveOrder::Power(false))),
             ("knock 7 on", Control::Knock(seven, Some(KNOCK_LEVEL))),
             ("knock 7 200", Control::Knock(seven, Some(200))),
             ("knock 7 off", Control::Knock(seven, None)),
@@ -277,22 +250,26 @@ mod tests {
             ("wrong length 3 1", Control::WrongLength(Tpdo::Three, Some(1))),
             ("wrong length 3 off", Control::WrongLength(Tpdo::Three, None)),
             ("late replies 150", Control::LateReplies(Some(Duration::from_millis(150)))),
-            ("second master on", Control::SecondMaster(true)),
-            ("duplicate on", Control::Duplicate(true)),
+            ("second master on", Control::Slave(SlaveOrder::SecondMaster(true))),
+            ("duplicate on", Control::Slave(SlaveOrder::Duplicate(true))),
             ("reserved bits on", Control::ReservedBits(true)),
-            ("refuse start on", Control::RefuseStart(true)),
-            ("boot loop off", Control::BootLoop(None)),
+            ("refuse start on", Control::Slave(SlaveOrder::RefuseStart(true))),
+            ("boot loop off", Control::Slave(SlaveOrder::BootLoop(None))),
         ] {
             assert_eq!(order(line), control, "{line}");
             let first = line.split(' ').next().unwrap();
-            assert!(HELP.lines().any(|help| help.starts_with(first)), "{first} is not in the help");
+            assert!(
+                HELP.lines().chain(slave::HELP.lines()).any(|help| help.starts_with(first)),
+                "{first} is not in the help"
+            );
         }
     }
 
     #[test]
     fn a_line_can_name_one_of_several_devices() {
         let order: Order = "  node 2   power on ".parse().unwrap();
-        assert_eq!(order, Order { node: NodeId::new(2), control: Control::Power(true) });
+        assert_eq!(order.node, NodeId::new(2));
+        assert_eq!(parse(&order.words()), Ok(Control::Slave(SlaveOrder::Power(true))));
     }
 
     #[test]
@@ -312,7 +289,7 @@ mod tests {
             ("node 128 trip", "1 to 127"),
             ("node 1 node 1 trip", "help"),
         ] {
-            let error = line.parse::<Order>().unwrap_err().to_string();
+            let error = control(line).unwrap_err();
             assert!(error.contains(mend), "{error}");
         }
     }
@@ -323,6 +300,45 @@ mod tests {
             ["trip", "eeprom_fault", "analog_output", "knock_intensity_20", "used_sensor_1", "bad_input_9"]
         {
             assert_eq!(Point::parse(name).unwrap().to_string(), name);
+        }
+    }
+
+    #[test]
+    fn an_order_that_would_do_nothing_is_refused_with_the_reason() {
+        let settings = DetconSettings::default();
+        let try_it = |line: &str| check(&settings, &line.split(' ').collect::<Vec<_>>());
+        for (line, reason) in [
+            ("knock 18 on", "16 cylinders"),
+            ("knock 17 off", "16 cylinders"),
+            ("sensor 18 bad", "16 cylinders"),
+            ("trip 0", "at least 100"),
+            ("trip 99", "at least 100"),
+        ] {
+            let error = try_it(line).unwrap_err();
+            assert!(error.contains(reason), "{line}: {error}");
+        }
+        for line in ["knock 16 on", "sensor 16 bad", "trip 100", "set knock_intensity_18 3"] {
+            assert!(try_it(line).is_ok(), "{line}");
+        }
+    }
+
+    #[test]
+    fn every_order_that_lasts_has_one_that_ends_it() {
+        let undone = |line: &str| undo(&line.split(' ').collect::<Vec<_>>());
+        for (line, end) in [
+            ("power off", "power on"),
+            ("knock 7 180", "knock 7 off"),
+            ("sensor 3 bad", "sensor 3 good"),
+            ("set trip 1", "clear trip"),
+            ("mute pdo 3 on", "mute pdo 3 off"),
+            ("wrong length 3 1", "wrong length 3 off"),
+            ("boot loop 1000", "boot loop off"),
+        ] {
+            assert_eq!(undone(line).as_deref(), Some(end));
+            assert!(control(end).is_ok(), "{end}");
+        }
+        for line in ["trip", "trip 100", "clear all", "clear trip", "knock 7 off", "sensor 3 good"] {
+            assert_eq!(undone(line), None, "{line}");
         }
     }
 }

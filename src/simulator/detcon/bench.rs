@@ -1,7 +1,8 @@
 //! A bus in numbers-time with one device on it, for the tests of this room.
 
-use super::detcon::{Detcon, DetconSettings};
+use super::super::slave::SlaveFaults;
 use super::faults::Faults;
+use super::protocol::{Detcon, DetconSettings};
 use super::values::Values;
 use crate::canopen::NodeId;
 use crate::time::Now;
@@ -82,6 +83,12 @@ impl Bench {
     pub fn faults(&mut self, millis: u64, change: impl FnOnce(&mut Faults)) {
         self.run_before(millis);
         self.device.update_faults(self.now(), change);
+        self.drain();
+    }
+
+    pub fn slave_faults(&mut self, millis: u64, change: impl FnOnce(&mut SlaveFaults)) {
+        self.run_before(millis);
+        self.device.update_slave_faults(self.now(), change);
         self.drain();
     }
 

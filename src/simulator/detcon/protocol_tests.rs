@@ -416,13 +416,13 @@ fn a_second_master_stops_and_guards_the_device() {
     let mut bench = Bench::operational(healthy(), 100);
     bench.run_to(1000);
     bench.take();
-    bench.faults(1000, |faults| faults.second_master = true);
+    bench.slave_faults(1000, |faults| faults.second_master = true);
     assert_eq!(bench.device.state(), Some(NmtState::Stopped));
     bench.run_to(1701);
     let expected =
         sent(&[(1000, "000#0201"), (1000, "701#R1"), (1001, "701#04"), (1700, "701#R1"), (1701, "701#84")]);
     assert_eq!(bench.take(), expected);
-    bench.faults(1800, |faults| faults.second_master = false);
+    bench.slave_faults(1800, |faults| faults.second_master = false);
     bench.run_to(9000);
     assert_eq!(bench.take(), []);
 }
@@ -430,7 +430,7 @@ fn a_second_master_stops_and_guards_the_device() {
 #[test]
 fn a_duplicate_sends_everything_twice() {
     let mut bench = Bench::operational(in_phase(), 1000);
-    bench.faults(1100, |faults| faults.duplicate = true);
+    bench.slave_faults(1100, |faults| faults.duplicate = true);
     bench.take();
     bench.frame(1200, "701#R1");
     bench.run_to(1500);
@@ -451,13 +451,13 @@ fn a_boot_loop_boots_again_and_again_until_switched_off() {
     let mut bench = Bench::operational(healthy(), 100);
     bench.run_to(1000);
     bench.take();
-    bench.faults(1000, |faults| faults.boot_loop = Some(Duration::from_secs(1)));
+    bench.slave_faults(1000, |faults| faults.boot_loop = Some(Duration::from_secs(1)));
     bench.run_to(4500);
     assert_eq!(bench.times("701#00"), [2000, 3000, 4000]);
-    bench.faults(4600, |faults| faults.boot_loop = Some(Duration::ZERO));
+    bench.slave_faults(4600, |faults| faults.boot_loop = Some(Duration::ZERO));
     bench.run_to(4900);
     assert_eq!(bench.times("701#00"), [4700, 4800, 4900]);
-    bench.faults(4900, |faults| faults.boot_loop = None);
+    bench.slave_faults(4900, |faults| faults.boot_loop = None);
     bench.run_to(9000);
     assert!(bench.times("701#00").is_empty());
 }
@@ -465,7 +465,7 @@ fn a_boot_loop_boots_again_and_again_until_switched_off() {
 #[test]
 fn refused_starts_leave_the_device_pre_operational() {
     let mut bench = Bench::powered(healthy());
-    bench.faults(100, |faults| faults.refuse_start = true);
+    bench.slave_faults(100, |faults| faults.refuse_start = true);
     bench.frame(200, "000#0101");
     assert_eq!(bench.device.state(), Some(NmtState::PreOperational));
 }
@@ -579,7 +579,7 @@ proptest! {
         for micros in jumps {
             let now = Now { instant: Instant::from_micros(micros), ..Now::default() };
             device.power_on(now);
-            device.update_faults(now, |faults| {
+            device.update_slave_faults(now, |faults| {
                 faults.second_master = true;
                 faults.boot_loop = Some(Duration::ZERO);
             });

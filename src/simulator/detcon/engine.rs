@@ -6,7 +6,7 @@
 
 use std::time::Duration;
 
-use super::random::Random;
+use super::super::random::Random;
 use super::values::{Channel, StatusBit, Values};
 use crate::time::Instant;
 

@@ -3,26 +3,22 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use super::super::slave::{QUEUE_LIMIT, Slave, SlaveFaults, SlaveWork};
 use super::cadence::{BASE_PERIOD, EventDriven, KNOCK_PERIOD, Periodic};
-use super::faults::{Faults, SHORTEST_BOOT_LOOP};
+use super::faults::Faults;
 use super::values::{Tpdo, Values, WireFormat};
 use crate::can::CanFrame;
 use crate::canopen::{NmtRequest, NmtState, NodeId, cob_id};
 use crate::time::{Instant, Now};
 
-/// Frames that wait to be sent, and guard requests that wait for their reply. Nothing fills them as long as the outputs
-/// are drained after each input; beyond, the newest is dropped, as a full controller would.
-const QUEUE_LIMIT: usize = 64;
-/// How often the second master guards.
-const FOREIGN_GUARD_PERIOD: Duration = Duration::from_millis(700);
-/// How often the second master stops the device.
-const FOREIGN_STOP_PERIOD: Duration = Duration::from_secs(10);
 /// All four TPDOs are sent within 100 ms of the start (R-DET-077).
 const LONGEST_STAGGER: Duration = Duration::from_millis(25);
 
 /// What a device is like. The default is what devices in the field are expected to do.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DetconSettings {
+    /// Cylinders of the engine that have a sensor, from channel 1 on, 0..=20.
+    pub cylinders: u8,
     /// From the boot-up message to pre-operational (R-DET-027).
     pub initialisation: Duration,
     /// From a guard request to its reply.
@@ -42,6 +38,7 @@ pub struct DetconSettings {
 impl Default for DetconSettings {
     fn default() -> Self {
         Self {
+            cylinders: 16,
             initialisation: Duration::from_millis(80),
             reply_delay: Duration::from_millis(1),
             stagger: Duration::from_millis(5),
@@ -56,12 +53,10 @@ impl Default for DetconSettings {
 /// The device. Powered off when made.
 #[derive(Clone, Debug)]
 pub struct Detcon {
-    node: NodeId,
+    slave: Slave,
     settings: DetconSettings,
     faults: Faults,
     values: Values,
-    /// `None` = powered off.
-    state: Option<NmtState>,
     initialised_at: Option<Instant>,
     /// Bit 7 of the next guard reply.
     toggle: bool,
@@ -70,19 +65,13 @@ pub struct Detcon {
     intensities: [(Tpdo, Periodic); 3],
     /// TPDO3.
     status: EventDriven,
-    foreign_guard_at: Option<Instant>,
-    foreign_stop_at: Option<Instant>,
-    restart_at: Option<Instant>,
-    outputs: VecDeque<CanFrame>,
 }
 
 /// What can become due.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Work {
-    Restart,
+    Slave(SlaveWork),
     FinishInitialisation,
-    ForeignStop,
-    ForeignGuard,
     Reply,
     Send(Tpdo),
 }
@@ -92,33 +81,28 @@ impl Detcon {
     #[must_use]
     pub fn new(node: NodeId, settings: DetconSettings) -> Self {
         Self {
-            node,
+            slave: Slave::new(node),
             settings,
             faults: Faults::default(),
             values: Values::default(),
-            state: None,
             initialised_at: None,
             toggle: false,
             replies: VecDeque::new(),
             intensities: [Tpdo::One, Tpdo::Two, Tpdo::Four].map(|tpdo| (tpdo, Periodic::default())),
             status: EventDriven::default(),
-            foreign_guard_at: None,
-            foreign_stop_at: None,
-            restart_at: None,
-            outputs: VecDeque::new(),
         }
     }
 
     /// Its node id.
     #[must_use]
     pub fn node(&self) -> NodeId {
-        self.node
+        self.slave.node()
     }
 
     /// Its NMT state; `None` = powered off.
     #[must_use]
     pub fn state(&self) -> Option<NmtState> {
-        self.state
+        self.slave.state()
     }
 
     /// What it measures and reports.
@@ -136,7 +120,7 @@ impl Detcon {
     /// Switches the power on: boot-up message, initialisation, pre-operational (R-DET-026, R-DET-027). No effect when on.
     pub fn power_on(&mut self, now: Now) {
         self.advance(now.instant);
-        if self.state.is_none() {
+        if self.state().is_none() {
             self.boot(now.instant);
             self.advance(now.instant);
         }
@@ -145,10 +129,8 @@ impl Detcon {
     /// Switches the power off: silence at once.
     pub fn power_off(&mut self, now: Now) {
         self.advance(now.instant);
-        self.state = None;
+        self.slave.power_off();
         self.initialised_at = None;
-        self.restart_at = None;
-        self.outputs.clear();
         self.silence();
     }
 
@@ -168,19 +150,21 @@ impl Detcon {
         self.advance(now.instant);
     }
 
-    /// Switches faults on and off.
+    /// Switches the faults of a `DetCon` on and off.
     pub fn update_faults(&mut self, now: Now, change: impl FnOnce(&mut Faults)) {
         self.advance_before(now.instant);
-        let (before, event_bytes) = (self.faults, self.event_bytes());
+        let event_bytes = self.event_bytes();
         change(&mut self.faults);
-        if self.faults.second_master != before.second_master {
-            let first = self.faults.second_master.then_some(now.instant);
-            (self.foreign_stop_at, self.foreign_guard_at) = (first, first);
-        }
-        if self.faults.boot_loop != before.boot_loop {
-            self.schedule_restart(now.instant);
-        }
         self.tell_event(now.instant, event_bytes);
+        self.advance(now.instant);
+    }
+
+    /// Switches the faults of any slave on and off.
+    pub fn update_slave_faults(&mut self, now: Now, change: impl FnOnce(&mut SlaveFaults)) {
+        self.advance_before(now.instant);
+        let mut faults = *self.slave.faults();
+        change(&mut faults);
+        self.slave.set_faults(now.instant, faults);
         self.advance(now.instant);
     }
 
@@ -198,7 +182,7 @@ impl Detcon {
 
     /// The next frame to send; call until `None`.
     pub fn poll_output(&mut self) -> Option<CanFrame> {
-        self.outputs.pop_front()
+        self.slave.poll_output()
     }
 
     /// When `handle_timeout` is to be called at the latest.
@@ -227,35 +211,26 @@ impl Detcon {
 
     /// The earliest work; of what is due at the same time, the first listed here.
     fn next_work(&self) -> Option<(Instant, Work)> {
-        let timers = [
-            (self.restart_at, Work::Restart),
-            (self.initialised_at, Work::FinishInitialisation),
-            (self.foreign_stop_at, Work::ForeignStop),
-            (self.foreign_guard_at, Work::ForeignGuard),
-            (self.replies.front().copied(), Work::Reply),
-        ];
+        let slave = self.slave.next_work().map(|(due, work)| (due, Work::Slave(work)));
+        let timers =
+            [(self.initialised_at, Work::FinishInitialisation), (self.replies.front().copied(), Work::Reply)];
         let [one, two, four] = self.intensities.map(|(tpdo, timer)| (timer.due(), Work::Send(tpdo)));
         let pdos = [one, two, (self.status.due(), Work::Send(Tpdo::Three)), four];
-        let all = timers.into_iter().chain(pdos);
-        all.filter_map(|(due, work)| Some((due?, work))).min_by_key(|(due, _)| *due)
+        let own = timers.into_iter().chain(pdos).filter_map(|(due, work)| Some((due?, work)));
+        slave.into_iter().chain(own).min_by_key(|(due, _)| *due)
     }
 
     fn perform(&mut self, now: Instant, work: Work) {
         match work {
-            Work::Restart => self.boot(now),
+            Work::Slave(SlaveWork::Restart) => self.boot(now),
+            Work::Slave(work @ (SlaveWork::ForeignStop | SlaveWork::ForeignGuard)) => {
+                if let Some(frame) = self.slave.interfere(now, work) {
+                    self.receive(now, &frame);
+                }
+            }
             Work::FinishInitialisation => {
                 self.initialised_at = None;
-                self.state = Some(NmtState::PreOperational);
-            }
-            Work::ForeignStop => {
-                self.foreign_stop_at = Some(now + FOREIGN_STOP_PERIOD);
-                self.interfere(now, NmtRequest::Stop.frame(Some(self.node)));
-            }
-            Work::ForeignGuard => {
-                self.foreign_guard_at = Some(now + FOREIGN_GUARD_PERIOD);
-                if let Some(request) = CanFrame::remote_frame(cob_id::error_control(self.node), 1) {
-                    self.interfere(now, request);
-                }
+                self.slave.enter(NmtState::PreOperational);
             }
             Work::Reply => {
                 self.replies.pop_front();
@@ -265,47 +240,30 @@ impl Detcon {
         }
     }
 
-    /// A frame of the second master: everybody on the bus sees it, this device too.
-    fn interfere(&mut self, now: Instant, frame: CanFrame) {
-        self.transmit(frame);
-        self.receive(now, &frame);
-    }
-
     /// Only NMT commands and guard requests concern the device (R-DET-006, R-DET-015).
     fn receive(&mut self, now: Instant, frame: &CanFrame) {
-        if self.state.is_none() {
-            return;
-        }
-        if frame.id() == cob_id::NMT {
-            if let [command, node] = *frame.data()
-                && (node == 0 || node == self.node.get())
-                && let Some(request) = NmtRequest::from_code(command)
-            {
-                self.obey(now, request);
-            }
-        } else if frame.is_remote() && frame.id() == cob_id::error_control(self.node) {
+        if let Some(request) = self.slave.command(frame) {
+            self.obey(now, request);
+        } else if frame.is_remote() && frame.id() == cob_id::error_control(self.node()) {
             self.guard(now);
         }
     }
 
     /// An NMT command to this device. During initialisation nobody listens (R-DET-019).
     fn obey(&mut self, now: Instant, request: NmtRequest) {
-        if self.state == Some(NmtState::Initialising) {
-            return;
-        }
         match request {
             NmtRequest::Start => {
-                if self.state != Some(NmtState::Operational) && !self.faults.refuse_start {
-                    self.state = Some(NmtState::Operational);
+                if self.state() != Some(NmtState::Operational) {
+                    self.slave.enter(NmtState::Operational);
                     self.start_tpdos(now);
                 }
             }
             NmtRequest::Stop => {
-                self.state = Some(NmtState::Stopped);
+                self.slave.enter(NmtState::Stopped);
                 self.stop_tpdos();
             }
             NmtRequest::EnterPreOperational if self.settings.all_nmt_commands => {
-                self.state = Some(NmtState::PreOperational);
+                self.slave.enter(NmtState::PreOperational);
                 self.stop_tpdos();
             }
             NmtRequest::ResetNode | NmtRequest::ResetCommunication if self.settings.all_nmt_commands => {
@@ -318,17 +276,9 @@ impl Detcon {
     fn boot(&mut self, now: Instant) {
         self.silence();
         self.toggle = false;
-        self.state = Some(NmtState::Initialising);
+        self.slave.boot(now);
         self.initialised_at = Some(now + self.settings.initialisation);
-        self.schedule_restart(now);
-        if let Some(message) = CanFrame::data_frame(cob_id::error_control(self.node), &[0]) {
-            self.transmit(message);
-        }
-    }
-
-    fn schedule_restart(&mut self, now: Instant) {
-        let interval = self.faults.boot_loop.filter(|_| self.state.is_some());
-        self.restart_at = interval.map(|interval| now + interval.max(SHORTEST_BOOT_LOOP));
+        self.slave.send_boot_up();
     }
 
     fn silence(&mut self) {
@@ -353,7 +303,8 @@ impl Detcon {
     }
 
     fn guard(&mut self, now: Instant) {
-        let booting = self.state == Some(NmtState::Initialising);
+        let Some(state) = self.state() else { return };
+        let booting = state == NmtState::Initialising;
         let silent = self.faults.mute_guarding || (booting && !self.settings.guard_in_boot);
         if !silent && self.replies.len() < QUEUE_LIMIT {
             self.replies.push_back(now + self.faults.late_replies.unwrap_or(self.settings.reply_delay));
@@ -361,15 +312,12 @@ impl Detcon {
     }
 
     fn reply(&mut self) {
-        let Some(state) = self.state else { return };
+        let Some(state) = self.state() else { return };
         let toggle = if self.toggle { 0x80 } else { 0 };
         if !self.faults.stuck_toggle {
             self.toggle = !self.toggle;
         }
-        if let Some(reply) = CanFrame::data_frame(cob_id::error_control(self.node), &[state.code() | toggle])
-        {
-            self.transmit(reply);
-        }
+        self.slave.send(cob_id::error_control(self.node()), &[state.code() | toggle]);
     }
 
     fn send_tpdo(&mut self, now: Instant, tpdo: Tpdo) {
@@ -384,19 +332,8 @@ impl Detcon {
         }
         let data = self.values.encode(tpdo, self.format());
         let length = usize::from(self.faults.length_of(tpdo));
-        let frame =
-            data.get(..length).and_then(|payload| CanFrame::data_frame(tpdo.can_id(self.node), payload));
-        if let Some(frame) = frame {
-            self.transmit(frame);
-        }
-    }
-
-    fn transmit(&mut self, frame: CanFrame) {
-        let copies = if self.faults.duplicate { 2 } else { 1 };
-        for _ in 0..copies {
-            if self.outputs.len() < QUEUE_LIMIT {
-                self.outputs.push_back(frame);
-            }
+        if let Some(payload) = data.get(..length) {
+            self.slave.send(tpdo.can_id(self.node()), payload);
         }
     }
 
@@ -425,5 +362,5 @@ impl Detcon {
 }
 
 #[cfg(test)]
-#[path = "detcon_tests.rs"]
+#[path = "protocol_tests.rs"]
 mod tests;

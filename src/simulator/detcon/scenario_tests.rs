@@ -1,16 +1,26 @@
-//! Tests of scenarios: reading, telling, and what each shipped one does on the bus.
+//! Tests of scenarios: reading, and what each shipped one does on the bus.
 
-use super::*;
+use std::time::Duration;
+
+use super::SCENARIOS as SHIPPED;
 use crate::canopen::{NmtState, NodeId};
-use crate::simulator::{DevicePlan, SimulatedDevice};
+use crate::simulator::{DevicePlan, Kind, Scenario, Settings};
 use crate::time::Now;
+
+fn shipped(name: &str) -> Option<Scenario> {
+    Scenario::shipped(Kind::Detcon, name)
+}
+
+fn parse(file: &str, text: &str) -> Result<Scenario, crate::simulator::SimulatorError> {
+    Scenario::parse(Kind::Detcon, file, text)
+}
 
 /// Runs a shipped scenario with a master that starts the device whenever it is not operational, asked every 500 ms.
 /// Gives everything the device sent, with its time.
 fn play(name: &str, until: u64) -> Vec<(u64, String)> {
-    let scenario = Scenario::shipped(name).unwrap();
+    let scenario = shipped(name).unwrap();
     let node = NodeId::new(1).unwrap();
-    let mut device = SimulatedDevice::power_on(&DevicePlan::new(node, scenario), Now::from_millis(0));
+    let mut device = DevicePlan::new(node, scenario).power_on(Now::from_millis(0));
     let mut log = Vec::new();
     for millis in 0..=until {
         let now = Now::from_millis(millis);
@@ -44,11 +54,11 @@ fn status_bytes(log: &[(u64, String)], byte: usize, from: u64, to: u64) -> Vec<u
 #[test]
 fn every_shipped_scenario_can_be_read_and_says_what_it_is() {
     for (name, text) in SHIPPED {
-        let scenario = Scenario::parse(name, text).unwrap_or_else(|error| panic!("{error}"));
-        assert_eq!(Scenario::shipped(name), Some(scenario.clone()));
+        let scenario = parse(name, text).unwrap_or_else(|error| panic!("{error}"));
+        assert_eq!(shipped(name), Some(scenario.clone()));
         assert!(!scenario.description.is_empty(), "{name}");
     }
-    assert!(Scenario::shipped("unheard_of").is_none());
+    assert!(shipped("unheard_of").is_none());
 }
 
 #[test]
@@ -169,14 +179,14 @@ fn demo_knocks_on_cylinder_7_by_second_8_then_loses_a_sensor_and_trips_within_mi
 
 #[test]
 fn the_two_devices_of_the_demo_take_turns() {
-    let power_on = |plan| SimulatedDevice::power_on(plan, Now::from_millis(0));
-    let mut devices: Vec<_> = crate::simulator::demo().iter().map(power_on).collect();
+    let plans = crate::simulator::demo();
+    let mut devices: Vec<_> = plans.iter().map(|plan| plan.power_on(Now::from_millis(0))).collect();
     assert_eq!(devices.iter().map(|device| device.node().get()).collect::<Vec<_>>(), [1, 2]);
     let mut first_knock = [None; 2];
     for millis in (0..60_000).step_by(50) {
         for (device, first) in devices.iter_mut().zip(&mut first_knock) {
             device.handle_timeout(Now::from_millis(millis));
-            if device.status().knocking && first.is_none() {
+            if device.status().says("knocking") && first.is_none() {
                 *first = Some(millis);
             }
         }
@@ -185,7 +195,7 @@ fn the_two_devices_of_the_demo_take_turns() {
 }
 
 #[test]
-fn a_story_of_all_actions_can_be_read() {
+fn a_story_with_all_keys_can_be_read() {
     let text = r#"
 description = "all"
 [device]
@@ -199,113 +209,91 @@ big_endian_sensor_fields = true
 status_invert_mask = 2
 [[step]]
 at_ms = 1
-do = { knock = { channel = 1, level = 3 } }
+do = "knock 12 3"
 [[step]]
 at_ms = 2
-do = { late_replies_ms = 150 }
-[[step]]
-at_ms = 3
-do = "reserved_bits"
-[[step]]
-at_ms = 4
-do = { boot_loop_ms = 1000 }
-[[step]]
-at_ms = 5
-do = "refuse_start"
-[[step]]
-at_ms = 6
-do = "duplicate"
+do = "late replies 150"
 [[step]]
 at_ms = 7
 for_ms = 10
 every_ms = 100
-do = { set = { trip = 1, analog_output = 40 } }
+do = ["set trip 1", "set  analog_output 40"]
 [[step]]
 at_ms = 8
-do = { clear = ["trip", "all"] }
+do = ["clear trip", "clear all"]
 "#;
-    let scenario = Scenario::parse("all.toml", text).unwrap();
-    assert_eq!(scenario.cylinders, 12);
-    assert_eq!(scenario.settings.initialisation, Duration::from_millis(200));
-    assert!(!scenario.settings.event_restarts_period && scenario.settings.format.big_endian_sensor_fields);
-    assert_eq!(scenario.settings.format.status_invert_mask, 2);
-    assert_eq!(scenario.events.len(), 6 + 4 + 2);
-    assert_eq!(scenario.events[10].control, Control::Clear("trip".parse_point()));
-}
-
-trait ParsePoint {
-    fn parse_point(&self) -> crate::simulator::Point;
-}
-
-impl ParsePoint for str {
-    fn parse_point(&self) -> crate::simulator::Point {
-        crate::simulator::Point::parse(self).unwrap()
-    }
+    let scenario = parse("all.toml", text).unwrap();
+    let Settings::Detcon(settings) = &scenario.settings else { panic!("{:?}", scenario.settings) };
+    assert_eq!(settings.cylinders, 12);
+    assert_eq!(settings.initialisation, Duration::from_millis(200));
+    assert!(!settings.event_restarts_period && settings.format.big_endian_sensor_fields);
+    assert_eq!(settings.format.status_invert_mask, 2);
+    let told: Vec<_> =
+        scenario.events.iter().map(|event| (event.at.as_millis(), event.order.as_str())).collect();
+    assert_eq!(
+        told,
+        [
+            (1, "knock 12 3"),
+            (2, "late replies 150"),
+            (7, "set trip 1"),
+            (7, "set analog_output 40"),
+            (17, "clear trip"),
+            (17, "clear analog_output"),
+            (8, "clear trip"),
+            (8, "clear all"),
+        ]
+    );
 }
 
 #[test]
 fn every_problem_is_told_at_once_with_line_column_and_hint() {
-    let text = "description = \"x\"\nrepeat_ms = 50\n\n[[step]]\nat_ms = 0\ndo = { knock = { channel = 21, level = 256 } }\n\n\
-                [[step]]\nat_ms = 0\nevery_ms = 1000\nfor_ms = 1000\ndo = \"mute_guarding\"\n\n\
-                [[step]]\nat_ms = 0\nfor_ms = 5\ndo = { clear = [\"tripp\"] }\n";
-    let error = Scenario::parse("s.toml", text).unwrap_err().to_string();
+    let text = "description = \"x\"\nrepeat_ms = 50\n\n[[step]]\nat_ms = 0\ndo = [\"knock 21 on\", \"knock 7 256\"]\n\n\
+                [[step]]\nat_ms = 0\nevery_ms = 1000\nfor_ms = 1000\ndo = \"mute guarding on\"\n\n\
+                [[step]]\nat_ms = 0\nfor_ms = 5\ndo = \"clear tripp\"\n\n\
+                [[step]]\nat_ms = 0\nfor_ms = 5\ndo = \"trip\"\n\n\
+                [[step]]\nat_ms = 0\nfor_ms = 0\ndo = \"sensor 17 bad\"\n";
+    let error = parse("s.toml", text).unwrap_err().to_string();
     for expected in [
         "s.toml:2:13: error: 50 ms is too short a time to repeat\n  hint: give at least 100",
-        "s.toml:6:28: error: 21 is not a channel\n  hint: give a number from 1 to 20",
-        "s.toml:6:40: error: 256 is not a raw intensity",
-        "s.toml:11:10: error: the action lasts 1000 ms and comes again after 1000 ms",
-        "s.toml:16:10: error: this action does not last",
-        "s.toml:17:17: error: there is no value `tripp`",
+        "s.toml:6:7: error: `knock 21 on` cannot be ordered\n  hint: `21` is not a channel; give a number from 1 to 20",
+        "s.toml:6:22: error: `knock 7 256` cannot be ordered\n  hint: `256` is not a raw intensity",
+        "s.toml:11:10: error: the step lasts 1000 ms and comes again after 1000 ms",
+        "s.toml:17:6: error: `clear tripp` cannot be ordered\n  hint: there is no value `tripp`",
+        "s.toml:21:10: error: `trip` does not last",
+        "s.toml:26:10: error: the step is over at the moment when it begins",
+        "s.toml:27:6: error: `sensor 17 bad` cannot be ordered\n  hint: the engine has 16 cylinders",
     ] {
         assert!(error.contains(expected), "{expected}\n---\n{error}");
     }
 }
 
 #[test]
-fn unknown_keys_and_actions_are_refused_where_they_stand() {
+fn unknown_keys_and_orders_are_refused_where_they_stand() {
     for (text, at) in [
         ("description = \"x\"\nrepet_ms = 1000\n", "s.toml:2:1: error: unknown field `repet_ms`"),
+        ("description = \"x\"\n[device]\ncylinder = 3\n", "s.toml:3:1: error: unknown field `cylinder`"),
         (
             "description = \"x\"\n[[step]]\nat_ms = 0\ndo = \"explode\"\n",
-            "s.toml:4:6: error: unknown variant `explode`",
+            "s.toml:4:6: error: `explode` cannot be ordered",
         ),
         ("description = \"x\"\n[[step]]\ndo = \"trip\"\n", "missing field `at_ms`"),
         ("description = \n", "s.toml:1:"),
         ("", "missing field `description`"),
     ] {
-        let error = Scenario::parse("s.toml", text).unwrap_err().to_string();
+        let error = parse("s.toml", text).unwrap_err().to_string();
         assert!(error.contains(at), "{error}");
     }
 }
 
-#[test]
-fn a_story_that_is_told_late_leaves_repetitions_out() {
-    let event = |at, control| Event {
-        at: Duration::from_millis(at),
-        every: Some(Duration::from_millis(1000)),
-        control,
-    };
-    let scenario = Scenario {
-        description: String::new(),
-        cylinders: 16,
-        settings: DetconSettings::default(),
-        events: vec![event(200, Control::Power(true)), event(100, Control::Power(false))],
-    };
-    let mut player = Player::new(&scenario, Instant::START);
-    assert_eq!(player.poll_timeout(), Some(Instant::from_millis(100)));
-    let told: Vec<_> = std::iter::from_fn(|| player.poll(Instant::from_millis(5150))).collect();
-    assert_eq!(told, [Control::Power(false), Control::Power(true)]);
-    assert_eq!(player.poll_timeout(), Some(Instant::from_millis(5200)));
-}
-
-const MANUAL: &str = include_str!("../../docs/simulator.md");
+const MANUAL: &str = include_str!("../../../docs/simulator.md");
 
 #[test]
 fn the_example_of_the_manual_can_be_read() {
     let (_, rest) = MANUAL.split_once("```toml\n").unwrap();
     let (example, _) = rest.split_once("```").unwrap();
-    let scenario = Scenario::parse("docs/simulator.md", example).unwrap_or_else(|error| panic!("{error}"));
-    assert_eq!((scenario.cylinders, scenario.events.len()), (12, 5));
+    let scenario = parse("docs/simulator.md", example).unwrap_or_else(|error| panic!("{error}"));
+    assert_eq!(scenario.events.len(), 5);
+    assert!(matches!(scenario.settings, Settings::Detcon(settings) if settings.cylinders == 12));
 }
 
 #[test]
@@ -313,7 +301,7 @@ fn the_manual_names_every_scenario_and_every_order() {
     for (name, _) in SHIPPED {
         assert!(MANUAL.contains(&format!("| `{name}` |")), "{name}");
     }
-    for line in crate::simulator::control::HELP.lines() {
+    for line in Kind::Detcon.help().lines() {
         let words = line.split(' ').take_while(|word| word.chars().all(|c| c.is_ascii_lowercase()));
         let order = words.take(2).filter(|word| !word.is_empty()).collect::<Vec<_>>().join(" ");
         assert!(MANUAL.contains(&format!("`{order}")), "{order}");

@@ -1,4 +1,4 @@
-//! What can be wrong with a simulated device. Every fault can be switched while the device runs.
+//! What can be wrong with a simulated `DetCon`. Every fault can be switched while the device runs.
 
 use std::time::Duration;
 
@@ -15,23 +15,11 @@ pub struct Faults {
     pub stuck_toggle: bool,
     /// Lengths (DLC, 0..=8) that TPDOs have instead of their own, by [`Tpdo::index`].
     pub wrong_length: [Option<u8>; 4],
-    /// Another master is on the bus: it guards this device and stops it from time to time.
-    pub second_master: bool,
-    /// Another device with the same node id: everything is sent twice.
-    pub duplicate: bool,
     /// Guard replies come this long after the request.
     pub late_replies: Option<Duration>,
     /// Reserved bits are set.
     pub reserved_bits: bool,
-    /// The device restarts by itself, again and again, with this time between two restarts (at least
-    /// [`SHORTEST_BOOT_LOOP`]).
-    pub boot_loop: Option<Duration>,
-    /// NMT start has no effect.
-    pub refuse_start: bool,
 }
-
-/// A boot loop is not faster than this.
-pub const SHORTEST_BOOT_LOOP: Duration = Duration::from_millis(100);
 
 impl Faults {
     /// Whether this TPDO is muted.
