@@ -10,6 +10,7 @@
 //! - [`builtin`]: the alarms that every gateway, bus and node has.
 //! - [`table`]: the result.
 //! - [`expression`]: conditions on tags; [`expression_parser`] reads them.
+//! - [`objection`]: why a value should not be used as it stands.
 //! - [`codec`]: raw bits to values, values to registers.
 //! - [`diagnostic`]: messages about files. [`reader`]: strict TOML; [`At`]: a value and its place; [`suggest`]: "did you mean".
 
@@ -23,6 +24,7 @@ pub mod expression_parser;
 pub mod file;
 pub mod file_values;
 pub mod installation;
+pub mod objection;
 pub mod reader;
 pub mod shipped;
 pub mod suggest;
@@ -34,6 +36,7 @@ pub use at::At;
 pub use build::{Installation, Sketch, build, check_mapping, is_name, sort_problems};
 pub use diagnostic::{Diagnostic, Severity, SourceText};
 pub use expression::Expression;
+pub use objection::Objection;
 pub use reader::{is_mapping, locate};
 pub use shipped::shipped;
 pub use table::{

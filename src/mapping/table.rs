@@ -39,6 +39,12 @@ impl TagTable {
         self.tags.get(tag.0)
     }
 
+    /// Digits after the decimal point of a value that belongs to a tag; 3 where it belongs to none.
+    #[must_use]
+    pub fn decimals(&self, tag: Option<TagIndex>) -> u8 {
+        tag.and_then(|tag| self.tag(tag)).map_or(3, |tag| tag.decimals)
+    }
+
     /// The tag of a node by its name.
     #[must_use]
     pub fn find_tag(&self, node: NodeIndex, name: &str) -> Option<TagIndex> {

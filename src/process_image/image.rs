@@ -1,6 +1,7 @@
 //! The process image: the last value of every tag and the state of every node, bus and alarm.
 
 use super::{AlarmIndex, AlarmStatus, BusStatus, Journal, NodeIndex, NodeStatus, Quality, Sample, TagIndex};
+use crate::time::Instant;
 
 /// Counts up with every change of the image. A reader remembers the last one it has seen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -28,6 +29,8 @@ pub struct ProcessImage {
     pub mqtt_connected: bool,
     /// Whether the wall clock is synchronised.
     pub clock_synchronised: bool,
+    /// When the gateway task wrote last, change or not: a sign of life, at least once a second.
+    pub written_at: Instant,
 }
 
 impl ProcessImage {
@@ -43,6 +46,7 @@ impl ProcessImage {
             journal: Journal::new(),
             mqtt_connected: false,
             clock_synchronised: false,
+            written_at: Instant::START,
         }
     }
 

@@ -116,12 +116,19 @@ impl Journal {
     }
 
     /// The events after `cursor` (the last `seq` that the reader has), oldest first, and how many it missed.
+    pub fn since(&self, cursor: u64) -> (impl Iterator<Item = &Event>, u64) {
+        let oldest = self.events.front().map_or(self.newest + 1, |event| event.seq);
+        let next = cursor.saturating_add(1);
+        // Numbers have no gap, so the place of the next one is known.
+        let seen = usize::try_from(next.saturating_sub(oldest)).unwrap_or(usize::MAX);
+        (self.events.iter().skip(seen), oldest.saturating_sub(next))
+    }
+
+    /// The same, copied.
     #[must_use]
     pub fn after(&self, cursor: u64) -> (Vec<Event>, u64) {
-        let oldest = self.events.front().map_or(self.newest + 1, |event| event.seq);
-        let missed = oldest.saturating_sub(cursor.saturating_add(1));
-        let events = self.events.iter().filter(|event| event.seq > cursor).cloned().collect();
-        (events, missed)
+        let (events, missed) = self.since(cursor);
+        (events.cloned().collect(), missed)
     }
 
     /// The last events, newest first.

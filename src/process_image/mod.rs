@@ -69,4 +69,16 @@ impl Sample {
         received_at: None,
         revision: Revision(0),
     };
+
+    /// The value to show: nothing where nothing was ever received; the last one otherwise, or 0 where the installation
+    /// asks for it (R-DET-084).
+    #[must_use]
+    pub fn shown(&self, zero_on_bad: bool) -> Option<Value> {
+        match (self.quality.is_usable(), zero_on_bad, self.value) {
+            (true, _, value) => Some(value),
+            (false, true, Value::Bool(_)) => Some(Value::Bool(false)),
+            (false, true, _) => Some(Value::Unsigned(0)),
+            (false, false, value) => self.received_at.map(|_| value),
+        }
+    }
 }

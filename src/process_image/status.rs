@@ -100,6 +100,26 @@ pub struct NodeCounters {
     pub frames_received: u64,
 }
 
+impl NodeCounters {
+    /// Each counter with its name in payloads and pages, and a sentence.
+    #[must_use]
+    pub fn named(&self) -> [(&'static str, &'static str, u64); 11] {
+        [
+            ("frames_received", "Frames received from the node", self.frames_received),
+            ("restarts", "Boot-up messages after the first contact", self.restarts),
+            ("guard_misses", "Guard requests without a reply in time", self.guard_misses),
+            ("toggle_errors", "Guard replies with the wrong toggle bit", self.toggle_errors),
+            ("pdo_length_errors", "TPDOs too short or too long", self.pdo_length_errors),
+            ("nmt_commands_sent", "NMT commands sent to the node", self.nmt_commands_sent),
+            ("emcys", "Emergency messages", self.emcys),
+            ("sdo_errors", "SDO transfers that failed", self.sdo_errors),
+            ("unexpected_states", "States that were not ordered", self.unexpected_states),
+            ("malformed", "Frames that cannot be right", self.malformed),
+            ("reserved_bits", "Frames with a reserved bit set", self.reserved_bits),
+        ]
+    }
+}
+
 /// What is known of one bus.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct BusStatus {
@@ -123,6 +143,22 @@ pub struct BusStatus {
     pub overruns: u64,
     /// Frames of identifiers that belong to no configured node, FD and 29-bit frames (R-DET-006).
     pub foreign_frames: u64,
+}
+
+impl BusStatus {
+    /// Each counter with its name in payloads and pages, and a sentence.
+    #[must_use]
+    pub fn named(&self) -> [(&'static str, &'static str, u64); 7] {
+        [
+            ("frames_received", "Frames received", self.frames_received),
+            ("frames_sent", "Frames sent", self.frames_sent),
+            ("frames_not_sent", "Frames that could not be sent", self.frames_not_sent),
+            ("errors", "Error frames", self.errors),
+            ("bus_off_count", "Times that the controller went bus-off", self.bus_off_count),
+            ("overruns", "Frames that the kernel dropped", self.overruns),
+            ("foreign_frames", "Frames that belong to no configured node", self.foreign_frames),
+        ]
+    }
 }
 
 /// State of a bus as readers see it.
