@@ -4,9 +4,10 @@
 //! inputs and for nothing else: a bus whose queue is full, or an asker who is gone, never holds it up.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot, watch};
-use tokio::time::sleep_until;
+use tokio::time::{MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use super::{Command, Gateway, Health, Input, Outcome, Output};
@@ -16,6 +17,9 @@ use crate::time::{Clock, Instant, Now};
 
 /// Events of buses that are taken in before the image is published once.
 const BATCH: usize = 128;
+
+/// The image is written at least this often, change or not: readers see by it that the core runs.
+const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
 
 /// All that the task holds besides its inputs.
 struct Driver {
@@ -50,6 +54,8 @@ pub async fn run(
     let first_health = *health.borrow_and_update();
     driver.take(clock.now(), Input::Health(first_health));
     driver.finish(Some(clock.now()));
+    let mut sign_of_life = interval(SIGN_OF_LIFE);
+    sign_of_life.set_missed_tick_behavior(MissedTickBehavior::Skip);
     while !buses_gone || !askers_gone {
         let due = driver.gateway.poll_timeout().map(|(due, _)| clock.deadline(due));
         let mut time_has_come_to = None;
@@ -69,6 +75,7 @@ pub async fn run(
                 driver.take(clock.now(), Input::Health(health));
             }
             () = sleep_until(due.unwrap_or_else(|| clock.deadline(Instant::START))), if due.is_some() => {}
+            _ = sign_of_life.tick() => {}
         }
         // While events wait, time has come as far as the newest that was taken and no further: a deadline must not
         // fire before the frame that keeps it, however late that is read.
@@ -118,8 +125,12 @@ impl Driver {
             self.gateway.handle_timeout(now);
             self.drain(now);
         }
-        let Self { gateway, writer, .. } = self;
-        writer.apply(|image| gateway.publish(image));
+        let Self { gateway, writer, clock, .. } = self;
+        let written_at = clock.now().instant;
+        writer.apply(|image| {
+            gateway.publish(image);
+            image.written_at = written_at;
+        });
     }
 
     fn drain(&mut self, now: Now) {
@@ -145,7 +156,6 @@ impl Driver {
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
-    use std::time::Duration;
 
     use super::*;
     use crate::can::Link;
@@ -164,8 +174,12 @@ mod tests {
     }
 
     fn start(transmit_bound: usize) -> Ends {
+        start_with(fixture::table(), transmit_bound)
+    }
+
+    fn start_with(table: crate::mapping::TagTable, transmit_bound: usize) -> Ends {
         let clock = Clock::start();
-        let gateway = Gateway::new(Arc::new(fixture::table()), clock.now());
+        let gateway = Gateway::new(Arc::new(table), clock.now());
         let (writer, reader) = process_image(gateway.empty_image());
         let (events, events_in) = mpsc::channel(1024);
         let (transmit, frames) = mpsc::channel(transmit_bound);
@@ -248,6 +262,18 @@ mod tests {
         let mut ends = start(64);
         ends.health.send(Health { mqtt_connected: Some(true), clock_synchronised: true }).unwrap();
         ends.until(|image| image.mqtt_connected && image.clock_synchronised).await;
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn the_image_is_written_every_second_though_nothing_happens() {
+        let ends = start_with(crate::mapping::TagTable::default(), 64);
+        tokio::time::sleep(Duration::from_secs(100)).await;
+        let written_at = ends.reader.read(|image| image.written_at);
+        assert!(ends.clock.now().instant.since(written_at) <= SIGN_OF_LIFE, "{written_at:?}");
+        ends.stop.cancel();
+        ends.task.await.unwrap();
+        tokio::time::sleep(Duration::from_secs(100)).await;
+        assert!(ends.reader.read(|image| image.written_at) <= written_at + SIGN_OF_LIFE);
     }
 
     #[tokio::test(start_paused = true)]
