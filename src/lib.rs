@@ -24,7 +24,8 @@
 //! | [`mapping`] | what bytes mean; the tag table | `process_image`, canopen ids and settings, `can::BusIndex`, bit rates |
 //! | [`alarms`] | the alarm list, pure | `process_image`, time |
 //! | [`gateway`] | joins the above, pure but for its task | can, canopen, `process_image`, mapping, alarms, time |
-//! | [`modbus`], [`mqtt`], [`web`] | the process image as registers, topics, pages | `process_image`, mapping, `gateway::command`, time |
+//! | [`slots`] | who must go when all places for connections are taken, pure | time |
+//! | [`modbus`], [`mqtt`], [`web`] | the process image as registers, topics, pages | `process_image`, mapping, `gateway::command`, slots, time |
 //! | [`simulator`] | pretend devices | can, canopen ids and NMT, time |
 //! | [`config`] | the installation's settings | each room's settings types |
 //! | [`supervisor`] | wires and watches the tasks | every room |
@@ -69,6 +70,7 @@ pub mod modbus;
 pub mod mqtt;
 pub mod process_image;
 pub mod simulator;
+pub mod slots;
 pub mod supervisor;
 pub mod telemetry;
 pub mod time;

@@ -1,9 +1,11 @@
-//! The places for connections, pure: who must go when all are taken.
+//! The places for connections of a server, pure: who must go when all are taken.
 //!
-//! The newcomer always gets in. It takes the place of the connection that has been silent for longest among those of the
-//! address that holds most: a flood from one address displaces itself and not the PLC that polls from another.
+//! The newcomer always gets in. Who has never asked for anything goes first; then the connection that has been silent for
+//! longest; in both cases one of the address that holds most. So a flood from one address displaces itself and not the
+//! PLC that polls from another, and connections that are opened and left alone do not displace one that works.
 
 use core::net::IpAddr;
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -15,15 +17,12 @@ use crate::time::Instant;
 pub struct Activity(AtomicU64);
 
 impl Activity {
-    fn new(now: Instant) -> Self {
-        Self(AtomicU64::new(now.as_micros()))
-    }
-
     /// It has sent a request.
     pub fn touch(&self, now: Instant) {
-        self.0.store(now.as_micros(), Ordering::Relaxed);
+        self.0.store(now.as_micros().max(1), Ordering::Relaxed);
     }
 
+    /// 0 before the first.
     fn last(&self) -> u64 {
         self.0.load(Ordering::Relaxed)
     }
@@ -73,29 +72,32 @@ impl<H> Slots<H> {
     }
 
     /// A place for a newcomer.
-    pub fn take(&mut self, address: IpAddr, handle: H, now: Instant) -> Taken<H> {
-        let full = self.taken.len() >= self.limit;
-        let evicted = if full { self.victim().and_then(|id| self.taken.remove(&id)) } else { None };
+    pub fn take(&mut self, address: IpAddr, handle: H) -> Taken<H> {
+        let evicted = if self.taken.len() >= self.limit { self.evict() } else { None };
         let id = SlotId(self.next);
         self.next += 1;
-        let activity = Arc::new(Activity::new(now));
+        let activity = Arc::new(Activity(AtomicU64::new(0)));
         self.taken.insert(id, Slot { address, activity: Arc::clone(&activity), handle });
-        Taken { id, activity, evicted: evicted.map(|slot| slot.handle) }
+        Taken { id, activity, evicted }
+    }
+
+    /// Takes the place of the one that must go; `None` where nobody has a place.
+    pub fn evict(&mut self) -> Option<H> {
+        let mut held: BTreeMap<IpAddr, usize> = BTreeMap::new();
+        for slot in self.taken.values() {
+            *held.entry(slot.address).or_default() += 1;
+        }
+        let order = |(id, slot): &(&SlotId, &Slot<H>)| {
+            let last = slot.activity.last();
+            (last > 0, Reverse(held.get(&slot.address).copied()), last, **id)
+        };
+        let victim = self.taken.iter().min_by_key(order).map(|(id, _)| *id)?;
+        self.taken.remove(&victim).map(|slot| slot.handle)
     }
 
     /// A connection has ended. Nothing, where it was evicted before.
     pub fn release(&mut self, id: SlotId) {
         self.taken.remove(&id);
-    }
-
-    fn victim(&self) -> Option<SlotId> {
-        let mut held: BTreeMap<IpAddr, usize> = BTreeMap::new();
-        for slot in self.taken.values() {
-            *held.entry(slot.address).or_default() += 1;
-        }
-        let most = held.values().copied().max()?;
-        let candidates = self.taken.iter().filter(|(_, slot)| held.get(&slot.address) == Some(&most));
-        candidates.min_by_key(|(id, slot)| (slot.activity.last(), **id)).map(|(id, _)| *id)
     }
 }
 
@@ -114,34 +116,69 @@ mod tests {
     #[test]
     fn f42_the_longest_silent_makes_room() {
         let mut slots = Slots::new(3);
-        let first = slots.take(address(1), "first", at(0));
-        slots.take(address(1), "second", at(1));
-        slots.take(address(1), "third", at(2));
-        first.activity.touch(at(3));
-        let newcomer = slots.take(address(1), "fourth", at(4));
-        assert_eq!(newcomer.evicted, Some("second"));
+        for (time, name) in (0..).zip(["first", "second", "third"]) {
+            slots.take(address(1), name).activity.touch(at(time));
+        }
+        let newcomer = slots.take(address(1), "fourth");
+        assert_eq!(newcomer.evicted, Some("first"));
         assert_eq!(slots.in_use(), 3);
     }
 
     #[test]
-    fn p25_a_flood_from_one_address_displaces_itself() {
+    fn who_never_asked_goes_before_who_works_oldest_first() {
         let mut slots = Slots::new(4);
-        slots.take(address(1), "plc", at(0));
-        let evicted: Vec<_> =
-            (1..100).filter_map(|time| slots.take(address(2), "flood", at(time)).evicted).collect();
-        assert_eq!(evicted.len(), 96);
-        assert!(evicted.iter().all(|who| *who == "flood"));
-        assert_eq!(slots.take(address(3), "other", at(100)).evicted, Some("flood"));
+        slots.take(address(1), "plc").activity.touch(at(0));
+        for name in ["a", "b", "c"] {
+            slots.take(address(1), name);
+        }
+        let evicted: Vec<_> = (0..100).filter_map(|_| slots.take(address(1), "script").evicted).collect();
+        assert_eq!(evicted[..4], ["a", "b", "c", "script"]);
+        assert!(
+            !evicted.contains(&"plc"),
+            "though it has been silent for longest, and is of the same address"
+        );
+    }
+
+    #[test]
+    fn p25_a_flood_from_one_address_displaces_itself() {
+        for asks in [false, true] {
+            let mut slots = Slots::new(4);
+            slots.take(address(1), "plc").activity.touch(at(1));
+            let flood = |time| {
+                let taken = slots.take(address(2), "flood");
+                if asks {
+                    taken.activity.touch(at(time));
+                }
+                taken.evicted
+            };
+            let evicted: Vec<_> = (2..101).filter_map(flood).collect();
+            assert_eq!(evicted.len(), 96);
+            assert!(evicted.iter().all(|who| *who == "flood"));
+            assert_eq!(slots.take(address(3), "other").evicted, Some("flood"));
+        }
+    }
+
+    #[test]
+    fn one_who_has_just_come_is_not_displaced_by_a_flood_from_elsewhere() {
+        let mut slots = Slots::new(4);
+        for _ in 0..3 {
+            slots.take(address(2), "flood");
+        }
+        slots.take(address(1), "plc");
+        assert_eq!(
+            (0..3).map(|_| slots.take(address(2), "flood").evicted.unwrap()).collect::<Vec<_>>(),
+            ["flood"; 3]
+        );
     }
 
     #[test]
     fn s2_no_place_is_lost_whatever_the_order() {
         let mut slots = Slots::new(2);
-        let ids: Vec<_> = (0..10).map(|time| slots.take(address(1), (), at(time)).id).collect();
+        let ids: Vec<_> = (0..10).map(|_| slots.take(address(1), ()).id).collect();
         assert_eq!(slots.in_use(), 2);
         for id in ids.iter().chain(&ids) {
             slots.release(*id);
         }
-        assert_eq!(slots.in_use(), 0);
+        assert_eq!((slots.in_use(), slots.evict()), (0, None));
     }
 }

@@ -27,9 +27,10 @@ const MAY_IMPORT: &[(&str, &[&str])] = &[
     ),
     ("alarms", &["process_image", "time"]),
     ("gateway", &["can", "canopen", "process_image", "mapping", "alarms", "time"]),
-    ("modbus", &["process_image", "mapping", "gateway::command", "time"]),
+    ("slots", &["time"]),
+    ("modbus", &["process_image", "mapping", "gateway::command", "slots", "time"]),
     ("mqtt", &["process_image", "mapping", "gateway::command", "time"]),
-    ("web", &["process_image", "mapping", "gateway::command", "time"]),
+    ("web", &["process_image", "mapping", "gateway::command", "slots", "time"]),
     ("simulator", &["can", "canopen", "time"]),
     (
         "config",

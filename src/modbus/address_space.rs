@@ -47,12 +47,6 @@ impl<S> AddressSpace<S> {
         self.entries.get(first..last)
     }
 
-    /// The published blocks.
-    #[must_use]
-    pub fn blocks(&self) -> &[Range<u32>] {
-        &self.covered
-    }
-
     /// All entries, by address.
     #[must_use]
     pub fn entries(&self) -> &[Entry<S>] {

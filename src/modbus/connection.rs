@@ -9,8 +9,8 @@ use super::counters::{Counters, End};
 use super::frame::{self, LONGEST_FRAME, Parsed};
 use super::register_bank::RegisterBank;
 use super::service;
-use super::slots::Activity;
 use crate::process_image::ImageReader;
+use crate::slots::Activity;
 use crate::time::Clock;
 
 /// What all connections share.
@@ -38,7 +38,7 @@ const INPUT: usize = 4_096;
 /// cannot make the server hoard them.
 const OUTPUT: usize = 16_384;
 
-/// Serves a client until it, the network, a time-out or `end` ends it. `end` is why the server may end it.
+/// Serves a client until it, the network, a time-out or one of `stops` ends it.
 pub async fn serve<S>(stream: S, shared: &Shared, activity: &Activity, stops: &Stops) -> End
 where
     S: AsyncReadExt + AsyncWriteExt + Unpin,
@@ -170,5 +170,54 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
             Ok(Err(_)) => Err(End::Broken),
             Err(_elapsed) => Err(End::SlowClient),
         }
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use crate::mapping::TagTable;
+    use crate::modbus::{ModbusSettings, RegisterMap};
+    use crate::process_image::{ProcessImage, process_image};
+    use crate::slots::Slots;
+
+    use super::*;
+
+    /// A gateway without nodes.
+    pub(in super::super) fn shared() -> Shared {
+        let table = std::sync::Arc::new(TagTable::default());
+        let settings = ModbusSettings::default();
+        let map = RegisterMap::build(&table, &settings, "cangate").unwrap();
+        let (_, reader) = process_image(ProcessImage::default());
+        Shared {
+            bank: RegisterBank::new(table, map.into()),
+            reader,
+            clock: Clock::start(),
+            counters: std::sync::Arc::default(),
+            idle_timeout: None,
+            partial_frame_timeout: settings.partial_frame_timeout(),
+            send_timeout: settings.send_timeout(),
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn p17_of_a_client_that_does_not_read_no_more_is_taken_than_one_buffer_of_answers() {
+        let (near, mut far) = tokio::io::duplex(64);
+        let shared = shared();
+        let asking = tokio::spawn(async move {
+            // Unit 247, the registers 0 to 99: 12 bytes for 209.
+            let request = [0, 1, 0, 0, 0, 6, 247, 4, 0, 0, 0, 100];
+            let mut sent = 0;
+            while far.write_all(&request).await.is_ok() {
+                sent += 1;
+            }
+            sent
+        });
+        let activity = Slots::new(1).take([127, 0, 0, 1].into(), ()).activity;
+        let stops = Stops { evict: CancellationToken::new(), stop: CancellationToken::new() };
+        assert_eq!(serve(near, &shared, &activity, &stops).await, End::SlowClient);
+        assert_eq!(shared.clock.now().instant.as_millis(), 5_000);
+        let answered = usize::try_from(shared.counters.values().requests).unwrap();
+        assert!(answered <= OUTPUT / 209 + 1, "{answered} answers");
+        assert!(asking.await.unwrap() <= answered + INPUT / 12 + 64 / 12 + 1);
     }
 }

@@ -12,7 +12,6 @@ const HIGHEST_CODE: usize = 11;
 pub struct Counters {
     accepted: AtomicU64,
     open: AtomicU64,
-    evicted: AtomicU64,
     accept_errors: AtomicU64,
     requests: AtomicU64,
     exceptions: [AtomicU64; HIGHEST_CODE + 1],
@@ -81,8 +80,6 @@ pub struct CounterValues {
     pub accepted: u64,
     /// Connections open now.
     pub open: u64,
-    /// Connections that had to make room for a new one.
-    pub evicted: u64,
     /// Times that accepting failed: no file descriptor, no memory.
     pub accept_errors: u64,
     /// Requests answered, exceptions included.
@@ -100,12 +97,6 @@ impl CounterValues {
     #[must_use]
     pub fn ended(&self, end: End) -> u64 {
         self.ended.get(end.place()).copied().unwrap_or_default()
-    }
-
-    /// Exceptions of one code.
-    #[must_use]
-    pub fn exception(&self, code: ExceptionCode) -> u64 {
-        self.exceptions.get(place(code)).copied().unwrap_or_default()
     }
 }
 
@@ -127,11 +118,6 @@ impl Counters {
     /// So many connections are open.
     pub fn set_open(&self, open: usize) {
         self.open.store(u64::try_from(open).unwrap_or(u64::MAX), Ordering::Relaxed);
-    }
-
-    /// A connection had to make room. Returns how many did before.
-    pub fn evicted(&self) -> u64 {
-        self.evicted.fetch_add(1, Ordering::Relaxed)
     }
 
     /// Accepting failed.
@@ -166,7 +152,6 @@ impl Counters {
         CounterValues {
             accepted: value(&self.accepted),
             open: value(&self.open),
-            evicted: value(&self.evicted),
             accept_errors: value(&self.accept_errors),
             requests: value(&self.requests),
             exceptions: self.exceptions.each_ref().map(value),

@@ -1,11 +1,15 @@
 //! Counters that go up by one per second while all is well: the cheapest watchdog that a PLC can have.
 
 use std::sync::atomic::{AtomicU16, Ordering};
+use std::time::Duration;
 
 use super::node_block::NodeView;
 use crate::mapping::TagTable;
 use crate::process_image::{NodeIndex, ProcessImage};
 use crate::time::Now;
+
+/// The core writes the image every second; when it has not for this long, it has stopped or cannot keep up.
+const CORE_SILENT: Duration = Duration::from_secs(3);
 
 /// One counter for each node and one for the gateway, modulo 65,536.
 #[derive(Debug)]
@@ -21,9 +25,12 @@ impl Heartbeats {
         Self { gateway: AtomicU16::new(0), nodes: (0..nodes).map(|_| AtomicU16::new(0)).collect() }
     }
 
-    /// To be called once a second: counts the gateway, and each node whose data is processed and fresh.
+    /// To be called once a second: counts the gateway while its core runs, and each node whose data is processed and
+    /// fresh.
     pub fn tick(&self, table: &TagTable, image: &ProcessImage, now: Now) {
-        self.gateway.fetch_add(1, Ordering::Relaxed);
+        if now.instant.since(image.written_at) <= CORE_SILENT {
+            self.gateway.fetch_add(1, Ordering::Relaxed);
+        }
         for (index, counter) in self.nodes.iter().enumerate() {
             let node = NodeView::new(table, image, NodeIndex(index), now);
             if node.is_some_and(|node| node.is_fresh()) {

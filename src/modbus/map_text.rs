@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
 use super::gateway_block::MAP_VERSION;
+use super::points::{hash, hash_text};
 use super::{MapDocument, Point, RegisterMap, Table, WordOrder};
 
 /// How the map is printed.
@@ -242,14 +243,40 @@ pub fn diff(old: &str, new: &str) -> Result<MapDiff, DiffError> {
     changes
         .lines
         .extend(added.map(|(place, point)| format!("added: {} at {}", meaning(point), place_text(*place))));
-    if changes.lines.is_empty() && old.hash != new.hash {
-        changes.broke(
-            "changed meaning: the order of the words of 32-bit values (`word_order` in [modbus]), or the layout of the \
-             fixed blocks: the hash differs though every point is the same"
-                .into(),
-        );
+    for line in differences_of_the_whole(&old, &new) {
+        changes.broke(line);
     }
     Ok(changes)
+}
+
+/// What holds for all points and stands in none of them: the version of the layout, and the order of words, which only the
+/// hash tells.
+fn differences_of_the_whole(old: &MapDocument, new: &MapDocument) -> Vec<String> {
+    let mut lines = Vec::new();
+    if old.version != new.version {
+        lines.push(format!("changed meaning: version {} of the layout is now {}", old.version, new.version));
+    }
+    match (word_order(old), word_order(new)) {
+        (Some(before), Some(after)) if before == after => {}
+        (Some(before), Some(after)) => lines.push(format!(
+            "changed meaning: 32-bit values were {}, are {} (`word_order` in [modbus])",
+            before.letters(),
+            after.letters()
+        )),
+        (before, _) if old != new => lines.push(format!(
+            "perhaps changed meaning: the hash of the {} map does not belong to its points, so that the order of the words \
+             of 32-bit values cannot be told; was the file edited?",
+            if before.is_none() { "old" } else { "new" }
+        )),
+        _ => {}
+    }
+    lines
+}
+
+/// The order of words that a map was made with; `None` where its hash is not that of its points.
+fn word_order(map: &MapDocument) -> Option<WordOrder> {
+    let orders = [WordOrder::Big, WordOrder::Little];
+    orders.into_iter().find(|order| hash_text(hash(map.version, &map.points, *order)) == map.hash)
 }
 
 impl MapDiff {
@@ -306,14 +333,18 @@ mod tests {
         }
     }
 
-    fn compare(old: &[Point], new: &[Point]) -> (Vec<String>, bool) {
-        let text = |points: &[Point], hash: &str| {
-            let document = MapDocument { version: 1, hash: hash.into(), points: points.to_vec() };
-            serde_json::to_string(&document).unwrap()
-        };
-        let hash = if old == new { "same" } else { "other" };
-        let diff = diff(&text(old, "same"), &text(new, hash)).unwrap();
+    fn document(points: &[Point], order: WordOrder) -> MapDocument {
+        MapDocument { version: 1, hash: hash_text(hash(1, points, order)), points: points.to_vec() }
+    }
+
+    fn compare_documents(old: &MapDocument, new: &MapDocument) -> (Vec<String>, bool) {
+        let text = |document: &MapDocument| serde_json::to_string(document).unwrap();
+        let diff = diff(&text(old), &text(new)).unwrap();
         (diff.lines, diff.breaking)
+    }
+
+    fn compare(old: &[Point], new: &[Point]) -> (Vec<String>, bool) {
+        compare_documents(&document(old, WordOrder::Big), &document(new, WordOrder::Big))
     }
 
     #[test]
@@ -375,12 +406,36 @@ mod tests {
     }
 
     #[test]
-    fn another_word_order_is_seen_by_the_hash() {
-        let text = |hash: &str| {
-            serde_json::to_string(&MapDocument { version: 1, hash: hash.into(), points: vec![point("a", 1)] })
-        };
-        let diff = diff(&text("a").unwrap(), &text("b").unwrap()).unwrap();
-        assert!(diff.breaking && diff.lines[0].contains("word_order"));
+    fn another_word_order_breaks_also_when_something_is_added() {
+        let (one, two) = ([point("a", 1)], [point("a", 1), point("b", 2)]);
+        for (old, new, lines) in [(&one[..], &one[..], 1), (&one[..], &two[..], 2)] {
+            let (old, new) = (document(old, WordOrder::Big), document(new, WordOrder::Little));
+            let (told, breaking) = compare_documents(&old, &new);
+            assert!(breaking && told.len() == lines, "{told:?}");
+            assert_eq!(
+                told[lines - 1],
+                "changed meaning: 32-bit values were ABCD, are CDAB (`word_order` in [modbus])"
+            );
+        }
+    }
+
+    #[test]
+    fn another_version_of_the_layout_breaks() {
+        let old = document(&[point("a", 1)], WordOrder::Big);
+        let hash = hash_text(hash(2, &old.points, WordOrder::Big));
+        let (lines, breaking) = compare_documents(&old, &MapDocument { version: 2, hash, ..old.clone() });
+        assert!(breaking && lines == ["changed meaning: version 1 of the layout is now 2"], "{lines:?}");
+    }
+
+    #[test]
+    fn a_map_whose_hash_does_not_belong_to_its_points_cannot_be_called_harmless() {
+        let good = document(&[point("a", 1)], WordOrder::Big);
+        let edited = MapDocument { hash: "0123456789abcdef".into(), ..good.clone() };
+        for (old, new, which) in [(&edited, &good, "the old map"), (&good, &edited, "the new map")] {
+            let (lines, breaking) = compare_documents(old, new);
+            assert!(breaking && lines[0].contains(which), "{lines:?}");
+        }
+        assert_eq!(compare_documents(&edited, &edited), (vec![], false), "the same file is the same map");
     }
 
     #[test]

@@ -14,7 +14,7 @@
 //!
 //! On the network:
 //! - [`server`] \[IO\]: listens, accepts, limits. [`connection`] \[IO\]: one client.
-//! - [`slots`]: who must go when all connections are in use. [`counters`]: what happened.
+//! - [`counters`]: what happened.
 
 pub mod address_space;
 pub mod connection;
@@ -34,7 +34,6 @@ pub mod register_map;
 pub mod server;
 pub mod service;
 pub mod settings;
-pub mod slots;
 mod source;
 
 pub use counters::{CounterValues, Counters, End};

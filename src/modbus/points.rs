@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::WordOrder;
 use super::event_ring;
-use super::gateway_block::{self, BUS_BLOCK, GATEWAY_BLOCK, MAP_VERSION};
+use super::gateway_block::{self, BUS_BLOCK, GATEWAY_BLOCK};
 use super::node_block::{self, NODE_BLOCK, Row};
 use super::register_map::alarm_groups;
 use super::source::source_text;
@@ -147,7 +147,7 @@ fn node_points(table: &TagTable, node: &NodeDef, topic: &str) -> Vec<Point> {
         }
     }
     for (bit, alarms) in alarm_groups(table, node) {
-        let (name, text, topic) = alarm_names(table, &alarms, topic);
+        let Some((name, text, topic)) = alarm_names(table, &alarms, topic) else { continue };
         let bits = [
             (node_block::ACTIVE_BITS, "active", "Active"),
             (node_block::UNACKNOWLEDGED_BITS, "unacknowledged", "Unacknowledged"),
@@ -190,18 +190,19 @@ fn tag_point(
     }
 }
 
-/// Name, text and topic of the alarms that share a bit: of the one, or of the array.
-fn alarm_names(table: &TagTable, alarms: &[AlarmIndex], topic: &str) -> (String, String, String) {
-    let defs: Vec<_> = alarms.iter().filter_map(|alarm| table.alarms.get(alarm.0)).collect();
-    match defs.as_slice() {
-        [] => (String::new(), String::new(), String::new()),
-        [one] => (one.name.clone(), one.text.clone(), format!("{topic}/alarm/{}", one.name)),
-        [first, .., last] => {
+/// Name, text and topic of the alarms that share a bit: of the one, or of the array. The topic of an array is a filter
+/// that all its topics match, and those of the node's other alarms too.
+fn alarm_names(table: &TagTable, alarms: &[AlarmIndex], topic: &str) -> Option<(String, String, String)> {
+    let mut defs = alarms.iter().filter_map(|alarm| table.alarms.get(alarm.0));
+    let first = defs.next()?;
+    Some(match defs.next_back() {
+        None => (first.name.clone(), first.text.clone(), format!("{topic}/alarm/{}", first.name)),
+        Some(last) => {
             let name = first.name.trim_end_matches(|c: char| c.is_ascii_digit()).trim_end_matches('_');
             let text = format!("one of {} .. {}", first.name, last.name);
             (name.to_owned(), text, format!("{topic}/alarm/+"))
         }
-    }
+    })
 }
 
 fn gateway_points(table: &TagTable, unit_id: u8) -> Vec<Point> {
@@ -278,11 +279,12 @@ impl Point {
     }
 }
 
-/// FNV-1a, 64 bits, over all that a client depends on. Texts for people are left out: another wording is no other map.
+/// FNV-1a, 64 bits, over all that tells a client where and how to read. Texts for people are left out: another wording is
+/// no other map. So is what stands in a register whose value is not valid (`on_loss`, `zero_on_bad`).
 #[must_use]
-pub fn hash(points: &[Point], word_order: WordOrder) -> u64 {
+pub fn hash(version: u16, points: &[Point], word_order: WordOrder) -> u64 {
     let mut hash = Fnv::new();
-    hash.field(&MAP_VERSION.to_string());
+    hash.field(&version.to_string());
     hash.field(word_order.letters());
     for point in points {
         hash.field(&point.node);
@@ -315,7 +317,12 @@ impl Fnv {
 
     /// Adds a text and an end mark, so that `a` `bc` is not `ab` `c`.
     fn field(&mut self, text: &str) {
-        for byte in text.bytes().chain([0xFF]) {
+        self.add(text.as_bytes());
+        self.add(&[0xFF]);
+    }
+
+    fn add(&mut self, bytes: &[u8]) {
+        for &byte in bytes {
             self.0 = (self.0 ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
         }
     }
@@ -327,11 +334,20 @@ mod tests {
 
     #[test]
     fn the_hash_is_fnv_1a() {
-        let mut hash = Fnv::new();
-        "foobar"
-            .bytes()
-            .for_each(|byte| hash.0 = (hash.0 ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3));
-        assert_eq!(hash.0, 0x8594_4171_f739_67e8);
+        // Test vectors of draft-eastlake-fnv, appendix C.
+        for (text, expected) in
+            [("", 0xcbf2_9ce4_8422_2325), ("a", 0xaf63_dc4c_8601_ec8c), ("foobar", 0x8594_4171_f739_67e8)]
+        {
+            let mut hash = Fnv::new();
+            hash.add(text.as_bytes());
+            assert_eq!(hash.0, expected, "{text}");
+        }
+        let (mut one, mut other) = (Fnv::new(), Fnv::new());
+        one.field("a");
+        one.field("bc");
+        other.field("ab");
+        other.field("c");
+        assert_ne!(one.0, other.0);
     }
 
     #[test]

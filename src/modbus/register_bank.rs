@@ -3,14 +3,13 @@
 use std::sync::Arc;
 
 use super::encoding::Cell;
-use super::event_ring::EventField;
 use super::gateway_block::{GatewayView, bus_register};
 use super::heartbeat::Heartbeats;
 use super::node_block::NodeView;
 use super::pdu::ExceptionCode;
 use super::register_map::{BitShow, RegisterMap, RegisterShow, TagRegister, Unit};
 use crate::mapping::{OnLoss, TagTable};
-use crate::process_image::{AlarmIndex, AlarmState, ProcessImage, Quality, Sample, TagIndex, Value};
+use crate::process_image::{AlarmIndex, AlarmState, ProcessImage, Quality, Sample, Value};
 use crate::time::Now;
 
 /// The register map joined to what it shows.
@@ -93,7 +92,7 @@ impl RegisterBank {
             let place = entry.address.checked_sub(start.into()).and_then(|place| usize::try_from(place).ok());
             if let Some(place) = place
                 && let Some(byte) = body.get_mut(place / 8)
-                && bit(image, &entry.show)?
+                && self.bit(image, &entry.show)?
             {
                 *byte |= 1 << (place % 8);
             }
@@ -116,12 +115,28 @@ impl RegisterBank {
                 image.buses.get(*bus).map_or(Cell::Word(0), |bus| bus_register(bus, *show))
             }
             RegisterShow::NewestEvent => Cell::low_double(image.journal.newest()),
-            RegisterShow::Event(place, field) => self.event(image, *place, *field),
+            RegisterShow::Event(place, field) => self.map.events().register(image, *place, *field),
         })
     }
 
-    fn event(&self, image: &ProcessImage, place: u16, field: EventField) -> Cell {
-        self.map.events().register(image, place, field)
+    /// A bit. It has no pattern for "invalid": it keeps its last value, and its validity bit drops.
+    fn bit(&self, image: &ProcessImage, show: &BitShow) -> Result<bool, ExceptionCode> {
+        let any = |alarms: &[AlarmIndex], such: fn(AlarmState) -> bool| {
+            alarms.iter().any(|alarm| image.alarm(*alarm).is_some_and(|alarm| such(alarm.state)))
+        };
+        Ok(match show {
+            BitShow::Tag(register) => {
+                let sample = image.tag(register.tag);
+                let lost = unusable(sample.quality, register)?.is_some();
+                sample.value.is_true() && !(lost && register.zero_on_bad)
+            }
+            BitShow::Validity { vouches_for } => vouches_for.iter().all(|tag| {
+                let def = self.table.tag(*tag);
+                def.is_some_and(|def| def.objection(image, image.tag(*tag)).is_none())
+            }),
+            BitShow::Active(alarms) => any(alarms, AlarmState::is_active),
+            BitShow::Unacknowledged(alarms) => any(alarms, AlarmState::is_unacknowledged),
+        })
     }
 }
 
@@ -153,24 +168,4 @@ fn unusable(quality: Quality, register: &TagRegister) -> Result<Option<Instead>,
         OnLoss::Hold if quality != Quality::NEVER => Ok(None),
         OnLoss::Hold | OnLoss::Invalid => Ok(Some(Instead::Invalid)),
     }
-}
-
-/// A bit. It has no pattern for "invalid": it keeps its last value, and its validity bit drops.
-fn bit(image: &ProcessImage, show: &BitShow) -> Result<bool, ExceptionCode> {
-    let any = |alarms: &[AlarmIndex], such: fn(AlarmState) -> bool| {
-        alarms.iter().any(|alarm| image.alarm(*alarm).is_some_and(|alarm| such(alarm.state)))
-    };
-    Ok(match show {
-        BitShow::Tag(register) => {
-            let sample = image.tag(register.tag);
-            let lost = unusable(sample.quality, register)?.is_some();
-            sample.value.is_true() && !(lost && register.zero_on_bad)
-        }
-        BitShow::Validity { tag, vouches_for } => {
-            let good = |tag: &TagIndex| image.tag(*tag).quality.is_good();
-            image.tag(*tag).value.is_true() && good(tag) && vouches_for.iter().all(good)
-        }
-        BitShow::Active(alarms) => any(alarms, AlarmState::is_active),
-        BitShow::Unacknowledged(alarms) => any(alarms, AlarmState::is_unacknowledged),
-    })
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::address_space::{AddressSpace, AddressSpaceBuilder};
 use super::event_ring::{self, EventCodes, EventField};
-use super::gateway_block::{self, BUS_BLOCK, BusRegister, GATEWAY_BLOCK, GatewayRegister};
+use super::gateway_block::{self, BUS_BLOCK, BusRegister, GATEWAY_BLOCK, GatewayRegister, MAP_VERSION};
 use super::identification::Identification;
 use super::node_block::{self, NODE_BLOCK, NodeRegister};
 use super::points::{self, Point};
@@ -71,10 +71,8 @@ pub struct TagRegister {
 pub enum BitShow {
     /// A bool tag.
     Tag(TagRegister),
-    /// A bool tag that tells whether other tags mean anything: true only while it and they are good.
+    /// A bool tag that tells whether other tags mean anything: true only while it is, and it and they are good.
     Validity {
-        /// The tag.
-        tag: TagIndex,
         /// The tags that it vouches for.
         vouches_for: Vec<TagIndex>,
     },
@@ -141,7 +139,7 @@ impl RegisterMap {
     pub fn build(table: &TagTable, settings: &ModbusSettings, base_topic: &str) -> Result<Self, MapError> {
         let gateway_unit_id = settings.gateway_unit_id;
         let points = points::points(table, gateway_unit_id, base_topic);
-        let hash = points::hash(&points, settings.word_order);
+        let hash = points::hash(MAP_VERSION, &points, settings.word_order);
         let mut builders: BTreeMap<u8, UnitBuilder> = BTreeMap::new();
         for (index, node) in table.nodes.iter().enumerate() {
             if node.unit_id == gateway_unit_id || matches!(node.unit_id, 0 | 255) {
@@ -241,7 +239,7 @@ impl UnitBuilder {
                     Space::Bit => {
                         bits_end = bits_end.max(end);
                         let show = match vouched.get(&tag) {
-                            Some(tags) => BitShow::Validity { tag, vouches_for: tags.clone() },
+                            Some(tags) => BitShow::Validity { vouches_for: tags.clone() },
                             None => BitShow::Tag(shown),
                         };
                         self.bits.show(claim.start, 1, show);

@@ -16,8 +16,8 @@ use super::ModbusSettings;
 use super::connection::{self, Shared, Stops};
 use super::counters::{Counters, End};
 use super::register_bank::RegisterBank;
-use super::slots::{SlotId, Slots};
 use crate::process_image::ImageReader;
+use crate::slots::{SlotId, Slots};
 use crate::time::Clock;
 
 /// A Modbus TCP server that listens already.
@@ -120,7 +120,10 @@ impl Server {
             tokio::select! {
                 () = stop.cancelled() => break,
                 _ = second.tick() => clients.tick(),
-                Some((stream, peer)) = newcomers.recv() => clients.admit(stream, peer).await,
+                Some(arrival) = newcomers.recv() => match arrival {
+                    Arrival::Client(stream, peer) => clients.admit(stream, peer).await,
+                    Arrival::NoDescriptor => clients.give_way().await,
+                },
                 Some(ended) = clients.tasks.join_next() => clients.ended(ended),
             }
         }
@@ -157,9 +160,9 @@ impl Clients {
             return;
         }
         let evict = CancellationToken::new();
-        let taken = self.slots.take(peer.ip(), evict.clone(), self.shared.clock.now().instant);
+        let taken = self.slots.take(peer.ip(), evict.clone());
         if let Some(other) = taken.evicted {
-            self.make_room(&other).await;
+            self.make_room(&other, self.slots.in_use()).await;
         }
         self.shared.counters.accepted(self.slots.in_use());
         tracing::debug!(%peer, "Modbus connection opened");
@@ -171,18 +174,24 @@ impl Clients {
         });
     }
 
-    /// Ends a connection and waits until its task is gone, so that there are never more tasks than places.
-    async fn make_room(&mut self, other: &CancellationToken) {
-        let before = self.shared.counters.evicted();
-        if before == 0 {
+    /// No file descriptor is left for a client that waits outside: one of those inside ends.
+    async fn give_way(&mut self) {
+        if let Some(other) = self.slots.evict() {
+            self.make_room(&other, self.slots.in_use() + 1).await;
+        }
+    }
+
+    /// Ends a connection and waits until there are fewer than `places`: so there are never more tasks than places.
+    async fn make_room(&mut self, other: &CancellationToken, places: usize) {
+        if self.shared.counters.values().ended(End::Evicted) == 0 {
             tracing::warn!(
-                limit = self.slots.in_use(),
-                "all Modbus connections are in use: the one that has been silent for longest makes room (told once; \
-                 raise `max_connections` in [modbus] if all of them are wanted)"
+                open = places,
+                "no room for another Modbus connection: one that never asked, or has been silent for longest, ends (told \
+                 once; raise `max_connections` in [modbus], or the limit of open files, if all of them are wanted)"
             );
         }
         other.cancel();
-        while self.tasks.len() >= self.slots.in_use() {
+        while self.tasks.len() >= places {
             let Some(ended) = self.tasks.join_next().await else { break };
             self.ended(ended);
         }
@@ -227,26 +236,36 @@ impl Accept for TcpListener {
     }
 }
 
-/// Accepts for ever. A failed accept (no file descriptor left, for example) is counted and tried again after a pause;
-/// the open connections do not notice.
-async fn accept(
-    mut listener: impl Accept,
-    accepted: mpsc::Sender<(TcpStream, SocketAddr)>,
-    counters: Arc<Counters>,
-) {
+/// What an acceptor tells.
+#[derive(Debug)]
+enum Arrival {
+    /// A client.
+    Client(TcpStream, SocketAddr),
+    /// A client waits, but the process or the system has no file descriptor for it.
+    NoDescriptor,
+}
+
+/// Accepts for ever. A failed accept is counted and tried again after a pause; where file descriptors have run out, an open
+/// connection is asked to give way.
+async fn accept(mut listener: impl Accept, accepted: mpsc::Sender<Arrival>, counters: Arc<Counters>) {
     let mut pause = ACCEPT_PAUSE;
     loop {
         match listener.accept().await {
-            Ok(connection) => {
+            Ok((stream, peer)) => {
                 pause = ACCEPT_PAUSE;
-                if accepted.send(connection).await.is_err() {
+                if accepted.send(Arrival::Client(stream, peer)).await.is_err() {
                     return;
                 }
             }
             Err(error) => {
                 counters.accept_error();
                 if pause == ACCEPT_PAUSE {
-                    tracing::warn!(%error, "cannot accept Modbus connections for now; the open ones go on");
+                    tracing::warn!(%error, "cannot accept Modbus connections for now");
+                }
+                let code = error.raw_os_error().map(nix::errno::Errno::from_raw);
+                if matches!(code, Some(nix::errno::Errno::EMFILE | nix::errno::Errno::ENFILE)) {
+                    // Where this queue is full, clients are being let in, and descriptors come free by that.
+                    let _ = accepted.try_send(Arrival::NoDescriptor);
                 }
                 tokio::time::sleep(pause).await;
                 pause = (pause * 2).min(LONGEST_ACCEPT_PAUSE);
@@ -257,6 +276,8 @@ async fn accept(
 
 #[cfg(test)]
 mod tests {
+    use tokio::io::AsyncReadExt;
+
     use super::*;
 
     struct OutOfDescriptors {
@@ -283,10 +304,39 @@ mod tests {
         let counters = Arc::new(Counters::default());
         let acceptor = OutOfDescriptors { failures: 20, listener };
         let accepting = tokio::spawn(accept(acceptor, sender, Arc::clone(&counters)));
-        assert!(accepted.recv().await.is_some());
+        assert!(matches!(accepted.recv().await, Some(Arrival::NoDescriptor)), "somebody has to give way");
+        while !matches!(accepted.recv().await, Some(Arrival::Client(..))) {}
         assert_eq!(counters.values().accept_errors, 20);
         drop(accepted);
         accepting.abort();
+    }
+
+    fn clients(places: usize) -> Clients {
+        Clients {
+            slots: Slots::new(places),
+            tasks: JoinSet::new(),
+            shared: Arc::new(connection::tests::shared()),
+            stop: CancellationToken::new(),
+        }
+    }
+
+    #[tokio::test]
+    async fn without_a_file_descriptor_one_client_gives_way_and_the_others_stay() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let mut clients = clients(8);
+        clients.give_way().await;
+        let mut near = Vec::new();
+        for _ in 0..3 {
+            near.push(TcpStream::connect(listener.local_addr().unwrap()).await.unwrap());
+            let (stream, peer) = listener.accept().await.unwrap();
+            clients.admit(stream, peer).await;
+        }
+        clients.give_way().await;
+        assert_eq!((clients.slots.in_use(), clients.tasks.len()), (2, 2));
+        let mut byte = [0];
+        assert_eq!(near[0].read(&mut byte).await.unwrap(), 0, "the oldest of those that never asked");
+        assert_eq!(clients.shared.counters.values().ended(End::Evicted), 1);
+        clients.stop.cancel();
     }
 
     #[tokio::test]

@@ -262,8 +262,27 @@ fn a_node_heartbeat_counts_while_its_data_is_fresh_even_if_the_gateway_itself_ha
     bank.tick(&image, at(3000));
     assert_eq!(heartbeat(&image), (3, 5));
     image.nodes[0].online = false;
+    image.written_at = Instant::from_millis(3050);
     bank.tick(&image, at(3100));
     assert_eq!(heartbeat(&image), (3, 6));
+}
+
+#[test]
+fn the_gateway_heartbeat_stops_when_its_core_has_not_written_for_three_seconds() {
+    let table = table();
+    let mut image = plant::image(&table);
+    let bank = bank(table, &ModbusSettings::default());
+    let heartbeat_at = |image: &ProcessImage, millis| {
+        bank.tick(image, at(millis));
+        read(&bank, image, 247, 0, 1)[0]
+    };
+    image.written_at = Instant::from_millis(10_000);
+    assert_eq!(heartbeat_at(&image, 10_500), 1);
+    assert_eq!(heartbeat_at(&image, 13_000), 2);
+    assert_eq!(heartbeat_at(&image, 13_001), 2, "modbus itself still runs");
+    assert_eq!(heartbeat_at(&image, 60_000), 2);
+    image.written_at = Instant::from_millis(60_500);
+    assert_eq!(heartbeat_at(&image, 61_000), 3);
 }
 
 #[test]
