@@ -3,16 +3,18 @@
 use std::fs;
 use std::path::Path;
 
+use cangate::modbus::{ModbusSettings, RegisterMap};
 use cangate::mqtt::json::JsonWriter;
 use cangate::mqtt::outbox::OutboxReport;
 use cangate::mqtt::payload::{self, Identity, Stamp};
-use cangate::mqtt::topics::{self, Topics};
+use cangate::mqtt::topics::Topics;
 use cangate::process_image::{
     AlarmIndex, AlarmState, AlarmStatus, EventKind, NodeIndex, NodeStatus, Priority, Quality, Reason,
     Revision, Sample, Value,
 };
 
 use crate::support::plant::{at, event, image, lose, table};
+use crate::support::registers;
 
 /// Holds a payload, byte for byte, against its file.
 fn assert_golden(name: &str, payload: &str) {
@@ -45,10 +47,19 @@ fn topics_stand_under_base_and_gateway() {
     assert_eq!(alarms[0], "plant/north/hall-1/bridge/alarm/mqtt_down");
     assert_eq!(alarms[1], "plant/north/hall-1/bridge/alarm/can0_bus_off");
     assert_eq!(alarms[7], "plant/north/hall-1/engine2/alarm/trip");
-    assert_eq!(
-        topics::node_state("cangate", &table(2), NodeIndex(0)).unwrap(),
-        "cangate/hall-1/engine1/state"
-    );
+}
+
+#[test]
+fn the_register_map_names_the_topics_that_are_published() {
+    let table = registers::table();
+    let topics = Topics::new("plant/north", &table);
+    let map = RegisterMap::build(&table, &ModbusSettings::default(), "plant/north").unwrap();
+    for (node, topics) in table.nodes.iter().zip(&topics.nodes) {
+        let point = map.points().iter().find(|point| point.node == node.name && point.tag == "trip").unwrap();
+        assert_eq!(point.topic, *topics.state);
+    }
+    let alarm = |name| map.points().iter().find(|point| point.tag == name).unwrap().topic.clone();
+    assert_eq!(alarm("alarm.trip.active"), *topics.alarms[4]);
 }
 
 #[test]

@@ -1,7 +1,10 @@
 //! What is published when, in numbers instead of time.
 
-use cangate::mqtt::{Identity, MqttSettings, Publisher};
-use cangate::process_image::{ProcessImage, Quality, Reason, Revision, Value};
+use std::collections::{BTreeMap, VecDeque};
+
+use cangate::mqtt::topics::Topics;
+use cangate::mqtt::{Identity, MqttSettings, Publisher, payload};
+use cangate::process_image::{NodeIndex, ProcessImage, Quality, Reason, Revision, Value};
 
 use crate::support::plant::{at, event, good, happen, image, lose, table};
 
@@ -256,4 +259,110 @@ fn a_broker_that_acknowledges_nothing_is_sent_no_more_than_the_window() {
     happen(&mut bench.image, 10);
     bench.publisher.handle_image(at(1), &bench.image);
     assert_eq!(std::iter::from_fn(|| bench.publisher.poll_output()).count(), 1);
+}
+
+/// What a broker keeps of a session in which only one message is acknowledged between two looks at the image.
+fn kept_by_a_slow_broker(publisher: &mut Publisher, image: &mut ProcessImage) -> BTreeMap<String, String> {
+    let mut kept = BTreeMap::new();
+    let mut unacknowledged = VecDeque::new();
+    for millis in 0..20_000 {
+        if millis % 100 == 0 && millis < 10_000 {
+            image.revision = Revision(image.revision.0 + 1);
+            let tag = usize::try_from(millis / 100 % 8).unwrap() * 4;
+            image.tags[tag] = good(Value::Float(f64::from(u32::try_from(millis).unwrap())));
+            happen(image, image.journal.newest() + 1);
+        }
+        publisher.handle_image(at(millis), image);
+        while let Some(out) = publisher.poll_output() {
+            assert!(unacknowledged.len() < 16);
+            unacknowledged.push_back(out.id);
+            if out.message.retain {
+                kept.insert(out.message.topic.to_string(), out.message.payload.to_string());
+            }
+        }
+        if let Some(id) = unacknowledged.pop_front() {
+            publisher.handle_acknowledged(id);
+        }
+    }
+    kept
+}
+
+#[test]
+fn p1_after_a_long_outage_the_broker_keeps_what_the_image_shows_and_not_what_it_showed() {
+    let table = table(127);
+    let mut image = image(&table);
+    let settings = MqttSettings { outbox_messages: 1000, ..MqttSettings::default() };
+    let mut publisher = Publisher::new(table.clone(), &settings, Identity::default());
+    for seq in 1..=3000 {
+        happen(&mut image, seq);
+        publisher.handle_image(at(0), &image);
+    }
+    assert_eq!((publisher.report().held.0, publisher.report().events_dropped), (1000, 2000));
+    lose(&mut image, &table, 1, at(0));
+    publisher.handle_session_up();
+    let kept = kept_by_a_slow_broker(&mut publisher, &mut image);
+    let topics = Topics::new("cangate", &table);
+    let mut out = String::new();
+    for ((def, status), topic) in table.alarms.iter().zip(&image.alarms).zip(&topics.alarms) {
+        payload::alarm(&mut out, &table, def, status);
+        assert_eq!(kept.get(&**topic), Some(&out), "{topic}");
+    }
+    for (place, topics) in topics.nodes.iter().enumerate() {
+        payload::availability(&mut out, &image.nodes[place]);
+        assert_eq!(kept.get(&*topics.availability), Some(&out), "{}", topics.availability);
+        let state: serde_json::Value = serde_json::from_str(&kept[&*topics.state]).unwrap();
+        let stamp = payload::Stamp { sid: "", seq: state["seq"].as_u64().unwrap() };
+        payload::state(&mut out, &table, &image, NodeIndex(place), stamp);
+        assert_eq!(kept[&*topics.state], out, "{}", topics.state);
+    }
+    assert_eq!(kept[&*topics.bridge_state], payload::ONLINE);
+    assert_eq!(kept.len(), 3 + 2 + 127 * 5);
+}
+
+#[test]
+fn a_validity_tag_that_is_not_published_itself_is_a_change_and_a_reason() {
+    let mut table = (*table(2)).clone();
+    table.tags[1].published = false;
+    let mut bench = Bench::new();
+    bench.publisher = Publisher::new(table.into(), &MqttSettings::default(), Identity::default());
+    bench.publisher.handle_session_up();
+    bench.sent(0);
+    bench.image.revision = Revision(2);
+    bench.image.tags[1].quality = Quality::Stale(Reason::PdoTimeout);
+    let sent = bench.sent(1000);
+    assert_eq!(sent[0].0, "engine1/state");
+    assert_eq!(sent[0].1["bad"], serde_json::json!({"knock_intensity_1": "pdo_timeout"}));
+    bench.change(1, Value::Bool(false));
+    assert_eq!(bench.sent(2000)[0].1["bad"], serde_json::json!({"knock_intensity_1": "not_valid"}));
+    bench.change(1, Value::Bool(true));
+    assert_eq!(bench.sent(3000)[0].1["bad"], serde_json::json!({}));
+}
+
+#[test]
+fn online_is_said_again_with_each_health_in_case_a_last_will_came_late() {
+    let mut bench = Bench::new();
+    let sent = bench.sent(30_000);
+    let states: Vec<_> = sent.iter().filter(|(topic, _)| topic == "bridge/state").collect();
+    assert_eq!(states.len(), 1);
+    assert_eq!(states[0].1["state"], "online");
+}
+
+#[test]
+fn at_a_stop_offline_goes_before_everything_that_still_waits() {
+    let mut bench = Bench::without_session();
+    bench.publisher.handle_session_up();
+    happen(&mut bench.image, 500);
+    bench.publisher.handle_image(at(0), &bench.image);
+    let sent: Vec<_> = std::iter::from_fn(|| bench.publisher.poll_output()).collect();
+    bench.publisher.handle_stop();
+    assert!(bench.publisher.poll_output().is_none(), "the window is closed");
+    bench.publisher.handle_acknowledged(sent[3].id);
+    let farewell = bench.publisher.poll_output().unwrap();
+    assert_eq!(&*farewell.message.payload, payload::OFFLINE);
+    for out in &sent {
+        bench.publisher.handle_acknowledged(out.id);
+    }
+    assert!(!bench.publisher.has_said_farewell());
+    bench.publisher.handle_acknowledged(farewell.id);
+    assert!(bench.publisher.has_said_farewell() && bench.publisher.is_idle());
 }

@@ -68,18 +68,7 @@ pub async fn run_at_pace(
 ) {
     let session = SessionSettings::new(&settings, gateway, publisher.last_will());
     status.send_modify(|status| status.broker = session.url.to_string());
-    let task = Task {
-        silence: pace.silence.max(session.keep_alive * 3 / 2),
-        session,
-        publisher,
-        reader,
-        clock,
-        stop,
-        status,
-        back_off: BackOff::new(pace),
-        drops: 0,
-        image: ImageWatch { alive: true, changed: true, next_read: Instant::START },
-    };
+    let task = Task::new(session, publisher, reader, clock, stop, status, pace);
     task.run::<RumqttcSession>().await;
 }
 
@@ -94,6 +83,8 @@ struct Task {
     silence: Duration,
     /// Sessions in a row that the broker took and soon dropped.
     drops: u32,
+    /// Why the attempt before failed; `None` after a session began.
+    told: Option<SessionError>,
     image: ImageWatch,
 }
 
@@ -115,6 +106,17 @@ enum Phase<U> {
     Session { uplink: U, began: Option<Instant>, progress: Instant },
 }
 
+/// How sending the rest at a stop ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Flushed {
+    /// The broker has what it was to have.
+    Done,
+    /// Not within the time.
+    Late,
+    /// The session ended.
+    Closed,
+}
+
 /// What the task woke up for.
 enum Wake {
     Stop,
@@ -124,6 +126,30 @@ enum Wake {
 }
 
 impl Task {
+    fn new(
+        session: SessionSettings,
+        publisher: Publisher,
+        reader: ImageReader,
+        clock: Clock,
+        stop: CancellationToken,
+        status: watch::Sender<MqttStatus>,
+        pace: Pace,
+    ) -> Self {
+        Self {
+            silence: pace.silence.max(session.keep_alive * 3 / 2),
+            session,
+            publisher,
+            reader,
+            clock,
+            stop,
+            status,
+            back_off: BackOff::new(pace),
+            drops: 0,
+            told: None,
+            image: ImageWatch { alive: true, changed: true, next_read: Instant::START },
+        }
+    }
+
     async fn run<U: Uplink>(mut self) {
         let mut phase: Phase<U> = Phase::Waiting { until: Instant::START };
         loop {
@@ -155,12 +181,12 @@ impl Task {
                 self.lost(began, &SessionError::Silent(self.silence))
             }
             Phase::Session { mut uplink, began, progress } => {
+                // While nothing is in flight, nothing can be overdue: the patience begins with what is sent now.
+                let progress = if self.publisher.in_flight() == 0 { now } else { progress };
                 if began.is_some() && !self.send(&mut uplink) {
                     return self
                         .lost(began, &SessionError::Lost("the session takes nothing more".to_owned()));
                 }
-                // While nothing is in flight, nothing can be overdue.
-                let progress = if self.publisher.in_flight() == 0 { now } else { progress };
                 Phase::Session { uplink, began, progress }
             }
             waiting @ Phase::Waiting { .. } => waiting,
@@ -187,6 +213,7 @@ impl Task {
             Happening::Connected => {
                 tracing::info!(broker = %self.session.url, "MQTT session is up");
                 self.publisher.handle_session_up();
+                self.told = None;
                 self.image.changed = true;
                 self.status.send_modify(|status| status.sessions = status.sessions.saturating_add(1));
                 Phase::Session { uplink, began: Some(now), progress: now }
@@ -225,8 +252,10 @@ impl Task {
                 self.drops, self.session.client_id
             );
         }
-        // Once at WARN; an absence that lasts does not fill the log.
-        if before == 0 || began.is_some() {
+        // Once at WARN, and again when the cause is another one; an absence that lasts does not fill the log.
+        let told = self.told.replace(error.clone());
+        let is_news = before == 0 || began.is_some() || !told.is_some_and(|told| told.is_kind_of(error));
+        if is_news {
             tracing::warn!(broker = %self.session.url, wait_ms = wait.as_millis(), "no MQTT session: {text}");
         } else {
             tracing::debug!(broker = %self.session.url, wait_ms = wait.as_millis(), "no MQTT session: {text}");
@@ -296,39 +325,119 @@ impl Task {
         });
     }
 
-    /// A stop in good order: what waits, then `offline`, then DISCONNECT, each within its time.
+    /// A stop in good order: what waits, then `offline`, then DISCONNECT. A broker that did not acknowledge `offline` in
+    /// time is left without a DISCONNECT: then it publishes the last will, which says the same.
     async fn stop<U: Uplink>(mut self, phase: Phase<U>) {
         let Phase::Session { mut uplink, began: Some(_), .. } = phase else { return self.report(false) };
         self.image.changed = true;
-        self.image.next_read = Instant::START;
-        self.read_image();
-        let mut open = self.flush(&mut uplink, FLUSH_TIMEOUT).await;
+        while self.image.changed || self.publisher.has_more() {
+            self.image.next_read = Instant::START;
+            self.read_image();
+        }
+        let rest = self.flush(&mut uplink, FLUSH_TIMEOUT, Publisher::is_idle).await;
         self.publisher.handle_stop();
-        open = open && self.flush(&mut uplink, OFFLINE_TIMEOUT).await;
-        if open {
+        if rest != Flushed::Closed
+            && self.flush(&mut uplink, OFFLINE_TIMEOUT, Publisher::has_said_farewell).await == Flushed::Done
+        {
             uplink.disconnect().await;
         }
         self.report(false);
     }
 
-    /// Sends until all is acknowledged or the time is over. `false` when the session ended.
-    async fn flush<U: Uplink>(&mut self, uplink: &mut U, limit: Duration) -> bool {
+    /// Sends until it is `done`, the time is over, or the session ends.
+    async fn flush<U: Uplink>(
+        &mut self,
+        uplink: &mut U,
+        limit: Duration,
+        done: fn(&Publisher) -> bool,
+    ) -> Flushed {
         let deadline = self.clock.deadline(self.clock.now().instant + limit);
         loop {
             if !self.send(uplink) {
-                return false;
+                return Flushed::Closed;
             }
-            if self.publisher.is_idle() {
-                return true;
+            if done(&self.publisher) {
+                return Flushed::Done;
             }
             tokio::select! {
-                () = tokio::time::sleep_until(deadline) => return true,
+                () = tokio::time::sleep_until(deadline) => return Flushed::Late,
                 happening = uplink.next() => match happening {
                     Happening::Acknowledged(id) => self.publisher.handle_acknowledged(id),
-                    Happening::Closed(_) => return false,
+                    Happening::Closed(_) => return Flushed::Closed,
                     Happening::Connected => {}
                 },
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::VecDeque;
+    use std::sync::Arc;
+
+    use super::super::outbox::{MessageId, Outgoing};
+    use super::super::payload::Identity;
+    use super::*;
+    use crate::mapping::TagTable;
+    use crate::process_image::{ImageWriter, ProcessImage, process_image};
+
+    /// How long the broker below takes for an acknowledgement.
+    const SLOW: Duration = Duration::from_secs(2);
+
+    /// A broker that takes every session and acknowledges everything, slowly.
+    struct SlowBroker {
+        clock: Clock,
+        connected: bool,
+        sent: VecDeque<(Instant, MessageId)>,
+    }
+
+    impl Uplink for SlowBroker {
+        async fn open(_: &SessionSettings) -> Result<Self, SessionError> {
+            Ok(Self { clock: Clock::start(), connected: false, sent: VecDeque::new() })
+        }
+
+        async fn next(&mut self) -> Happening {
+            if !self.connected {
+                self.connected = true;
+                return Happening::Connected;
+            }
+            let Some((due, id)) = self.sent.front().copied() else { std::future::pending().await };
+            tokio::time::sleep_until(self.clock.deadline(due)).await;
+            self.sent.pop_front();
+            Happening::Acknowledged(id)
+        }
+
+        fn send(&mut self, outgoing: &Outgoing) -> bool {
+            self.sent.push_back((self.clock.now().instant + SLOW, outgoing.id));
+            true
+        }
+
+        async fn disconnect(self) {}
+    }
+
+    fn task(keep_alive_s: u16) -> (Task, ImageWriter, watch::Receiver<MqttStatus>, CancellationToken) {
+        let settings = MqttSettings { keep_alive_s, ..MqttSettings::default() };
+        let publisher = Publisher::new(Arc::new(TagTable::default()), &settings, Identity::default());
+        let (writer, reader) = process_image(ProcessImage::new(0, 0, 0, 0));
+        let (sender, status) = watch::channel(MqttStatus::default());
+        let stop = CancellationToken::new();
+        let session = SessionSettings::new(&settings, "hall-1", publisher.last_will());
+        let task =
+            Task::new(session, publisher, reader, Clock::start(), stop.clone(), sender, Pace::default());
+        (task, writer, status, stop)
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_time_in_which_nothing_was_to_be_said_is_no_silence_of_the_broker() {
+        // Health goes out every 30 s; a broker is silent after 10 s.
+        let (task, _writer, status, stop) = task(5);
+        let running = tokio::spawn(task.run::<SlowBroker>());
+        tokio::time::sleep(Duration::from_secs(200)).await;
+        let seen = status.borrow().clone();
+        assert_eq!((seen.sessions, seen.failures), (1, 0), "{}", seen.last_error);
+        assert!(seen.outbox.acknowledged >= 12, "{:?}", seen.outbox);
+        stop.cancel();
+        running.await.unwrap();
     }
 }

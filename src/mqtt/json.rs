@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::process_image::Value;
+use crate::process_image::value::write_rounded;
 
 /// Writes members of nested objects and arrays, with the commas where they belong.
 #[derive(Debug)]
@@ -122,25 +123,14 @@ pub fn is_representable(value: Value) -> bool {
 
 /// A value as JSON: a bit as `true` or `false`, a number with at most `decimals` digits and no trailing zeros.
 fn number(out: &mut String, value: Value, decimals: u8) {
-    // Above this a double has no digits after the point, and fixed notation would only be long.
-    const LARGE: f64 = 1e15;
     let _ = match value {
         Value::Bool(bit) => write!(out, "{bit}"),
         Value::Unsigned(whole) => write!(out, "{whole}"),
         Value::Signed(whole) => write!(out, "{whole}"),
         Value::Float(number) if !number.is_finite() => out.write_str("null"),
-        Value::Float(number) if number.abs() >= LARGE => write!(out, "{number:e}"),
         Value::Float(number) => {
-            let start = out.len();
-            let result = write!(out, "{number:.*}", usize::from(decimals));
-            if out.get(start..).is_some_and(|text| text.contains('.')) {
-                out.truncate(out.trim_end_matches('0').trim_end_matches('.').len());
-            }
-            if out.get(start..) == Some("-0") {
-                out.truncate(start);
-                out.push('0');
-            }
-            result
+            write_rounded(out, number, decimals);
+            Ok(())
         }
     };
 }

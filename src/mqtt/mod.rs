@@ -20,7 +20,7 @@ pub mod topics;
 pub mod uplink;
 
 pub use client::MqttStatus;
-pub use outbox::{Class, OutboxReport};
+pub use outbox::OutboxReport;
 pub use payload::Identity;
 pub use publisher::Publisher;
 pub use settings::MqttSettings;

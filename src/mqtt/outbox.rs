@@ -1,45 +1,17 @@
-//! What the broker has not acknowledged yet: ordered, bounded in count and bytes, in memory.
+//! What the broker has not acknowledged yet: ordered, bounded, in memory.
 //!
 //! Two lanes take turns, so that what is live never waits behind a backlog of events:
 //!
-//! - *latest*: retained topics. Of one topic only the newest message waits; it takes the place of the one before.
-//! - *all*: events. Every one is kept, in order.
+//! - *latest*: retained topics. Of one topic only the newest message waits; it takes the place of the one before. There
+//!   are only so many topics, so nothing has to leave this lane: what was told to it reaches the broker.
+//! - *events*: every one is kept, in order, within the limits in count and bytes. When they are full, the oldest leaves.
 //!
 //! A message is forgotten when it is acknowledged, superseded by a newer one of its retained topic, or dropped because
 //! the outbox is full; the last two are counted. When the session is lost, events that were not acknowledged go back in
 //! front, in order, and will be sent again; what is retained is let go, because each session begins with all of it.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
-
-/// What a message is, in the order in which messages leave a full outbox.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Class {
-    /// Values: soon replaced by newer ones.
-    Sample,
-    /// How gateway and nodes are.
-    Status,
-    /// The present state of an alarm.
-    Alarm,
-    /// What happened.
-    Event,
-}
-
-impl Class {
-    /// All classes, the first to leave first.
-    pub const ALL: [Self; 4] = [Self::Sample, Self::Status, Self::Alarm, Self::Event];
-
-    /// The word in `bridge/health` and metrics.
-    #[must_use]
-    pub fn word(self) -> &'static str {
-        match self {
-            Self::Sample => "sample",
-            Self::Status => "status",
-            Self::Alarm => "alarm",
-            Self::Event => "event",
-        }
-    }
-}
 
 /// A message for the broker.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -49,11 +21,10 @@ pub struct Message {
     /// JSON.
     pub payload: Arc<str>,
     /// Quality of service 1, else 0.
-    pub acknowledged: bool,
-    /// The broker keeps it for later subscribers; of those that wait only the newest is kept.
+    pub at_least_once: bool,
+    /// The broker keeps it for later subscribers; of those that wait only the newest is kept. What is not retained is an
+    /// event.
     pub retain: bool,
-    /// When it leaves a full outbox.
-    pub class: Class,
 }
 
 impl Message {
@@ -82,9 +53,9 @@ pub struct Outgoing {
 /// What fits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// Messages, sent and waiting.
+    /// Events, sent and waiting.
     pub messages: usize,
-    /// Bytes of topics and payloads, sent and waiting.
+    /// Bytes of topics and payloads of events, sent and waiting.
     pub bytes: usize,
     /// Messages that may be sent and not acknowledged at the same time.
     pub window: usize,
@@ -95,21 +66,24 @@ pub struct Limits {
 /// Fill and counters since the start. Counters saturate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct OutboxReport {
-    /// Messages in the outbox.
+    /// Messages in the outbox: events, and at most one waiting for each retained topic.
     pub messages: usize,
-    /// Most messages.
+    /// Most events.
     pub messages_limit: usize,
     /// Bytes in the outbox.
     pub bytes: usize,
-    /// Most bytes.
+    /// Most bytes of events.
     pub bytes_limit: usize,
+    /// Events in the outbox, and their bytes: what the limits hold for.
+    pub held: (usize, usize),
     /// Times that a message was handed to the session.
     pub sent: u64,
     /// Of those: after an earlier try whose session ended.
     pub sent_again: u64,
     /// Acknowledged by the broker.
     pub acknowledged: u64,
-    /// Retained messages that a newer one of the same topic replaced before they were acknowledged.
+    /// Retained messages that were let go without an acknowledgement: a newer one of the same topic replaced them, or the
+    /// session was lost.
     pub superseded: u64,
     /// Larger than the limit of one message.
     pub too_large: u64,
@@ -117,14 +91,16 @@ pub struct OutboxReport {
     pub events_missed: u64,
     /// Events taken in, and their bytes: for the forecast.
     pub events: (u64, u64),
-    /// Dropped because the outbox was full, by the place of the class in [`Class::ALL`].
-    pub dropped_by_class: [u64; 4],
+    /// Events dropped because the outbox was full.
+    pub events_dropped: u64,
 }
 
 impl OutboxReport {
-    /// Messages dropped because the outbox was full, of each class.
-    pub fn dropped(&self) -> impl Iterator<Item = (Class, u64)> + '_ {
-        Class::ALL.into_iter().zip(self.dropped_by_class)
+    /// Messages dropped because the outbox was full, by class. Only events can be; the other classes are a promise of
+    /// version 1 of the payloads.
+    #[must_use]
+    pub fn dropped(&self) -> [(&'static str, u64); 4] {
+        [("sample", 0), ("status", 0), ("alarm", 0), ("event", self.events_dropped)]
     }
 
     /// How long events at their mean rate so far would take to fill what is free; `None` before the first event.
@@ -135,8 +111,8 @@ impl OutboxReport {
         let (events, bytes) = self.events;
         let hours = uptime_s.max(1) as f64 / 3600.0;
         let left = |free: usize, used: u64| free as f64 / (used as f64 / hours);
-        let by_count = left(self.messages_limit.saturating_sub(self.messages), events);
-        let by_bytes = left(self.bytes_limit.saturating_sub(self.bytes), bytes);
+        let by_count = left(self.messages_limit.saturating_sub(self.held.0), events);
+        let by_bytes = left(self.bytes_limit.saturating_sub(self.held.1), bytes);
         (events > 0).then(|| by_count.min(by_bytes).min(10_000.0))
     }
 }
@@ -156,10 +132,8 @@ pub struct Outbox {
     latest: BTreeMap<MessageId, Entry>,
     /// Where the waiting message of a retained topic stands.
     latest_of: BTreeMap<Arc<str>, MessageId>,
-    /// Other messages that wait, oldest first.
-    all: BTreeMap<MessageId, Entry>,
-    /// Waiting messages by class, for dropping.
-    waiting: [BTreeSet<MessageId>; 4],
+    /// Events that wait, oldest first.
+    events: BTreeMap<MessageId, Entry>,
     /// Sent, not acknowledged.
     in_flight: BTreeMap<MessageId, Entry>,
     next: u64,
@@ -181,8 +155,7 @@ impl Outbox {
             limits,
             latest: BTreeMap::new(),
             latest_of: BTreeMap::new(),
-            all: BTreeMap::new(),
-            waiting: Default::default(),
+            events: BTreeMap::new(),
             in_flight: BTreeMap::new(),
             next: 0,
             latest_turn: true,
@@ -190,14 +163,14 @@ impl Outbox {
         }
     }
 
-    /// Takes a message in. When that is too much, others leave: the lowest class first, and of a class the oldest.
-    /// What was sent already does not leave.
-    pub fn push(&mut self, message: Message) {
+    /// Takes a message in. Where that is one event too many, the oldest that wait leave. What was sent already does not
+    /// leave. `None` for a message that no broker would take.
+    pub fn push(&mut self, message: Message) -> Option<MessageId> {
         if message.size() > self.limits.message {
-            self.report.too_large = self.report.too_large.saturating_add(1);
-            return;
+            count(&mut self.report.too_large);
+            return None;
         }
-        if message.class == Class::Event {
+        if !message.retain {
             let (events, bytes) = self.report.events;
             let size = u64::try_from(message.size()).unwrap_or(u64::MAX);
             self.report.events = (events.saturating_add(1), bytes.saturating_add(size));
@@ -206,14 +179,15 @@ impl Outbox {
         let id = superseded.unwrap_or_else(|| self.next_id());
         if superseded.is_some() {
             self.remove_waiting(id);
-            self.report.superseded = self.report.superseded.saturating_add(1);
+            count(&mut self.report.superseded);
         }
         self.insert_waiting(id, Entry { message, sent_before: false });
-        while self.report.messages > self.limits.messages || self.report.bytes > self.limits.bytes {
-            if !self.drop_one() {
-                break;
-            }
+        while self.report.held.0 > self.limits.messages || self.report.held.1 > self.limits.bytes {
+            let Some(oldest) = self.events.keys().next().copied() else { break };
+            self.remove_waiting(oldest);
+            count(&mut self.report.events_dropped);
         }
+        Some(id)
     }
 
     /// The next message to send, while the window is open.
@@ -221,14 +195,16 @@ impl Outbox {
         if self.in_flight.len() >= self.limits.window {
             return None;
         }
-        let from_latest = (self.latest_turn || self.all.is_empty()) && !self.latest.is_empty();
-        let lane = if from_latest { &self.latest } else { &self.all };
+        let from_latest = (self.latest_turn || self.events.is_empty()) && !self.latest.is_empty();
+        let lane = if from_latest { &self.latest } else { &self.events };
         let id = *lane.keys().next()?;
         self.latest_turn = !from_latest;
         let entry = self.remove_waiting(id)?;
         self.count_in(&entry);
-        self.report.sent = self.report.sent.saturating_add(1);
-        self.report.sent_again = self.report.sent_again.saturating_add(u64::from(entry.sent_before));
+        count(&mut self.report.sent);
+        if entry.sent_before {
+            count(&mut self.report.sent_again);
+        }
         let outgoing = Outgoing { id, message: entry.message.clone(), again: entry.sent_before };
         self.in_flight.insert(id, entry);
         Some(outgoing)
@@ -238,7 +214,7 @@ impl Outbox {
     pub fn handle_acknowledged(&mut self, id: MessageId) {
         if let Some(entry) = self.in_flight.remove(&id) {
             self.count_out(&entry);
-            self.report.acknowledged = self.report.acknowledged.saturating_add(1);
+            count(&mut self.report.acknowledged);
         }
     }
 
@@ -247,15 +223,20 @@ impl Outbox {
         for (id, entry) in std::mem::take(&mut self.in_flight) {
             self.count_out(&entry);
             if entry.message.retain {
-                self.report.superseded = self.report.superseded.saturating_add(1);
+                count(&mut self.report.superseded);
             } else {
                 self.insert_waiting(id, Entry { sent_before: true, ..entry });
             }
         }
-        let retained: Vec<_> = self.latest.keys().copied().collect();
-        for id in retained {
+        self.let_go_of_latest();
+    }
+
+    /// Nothing that waits will be sent any more; what is in flight may still be acknowledged.
+    pub fn clear_waiting(&mut self) {
+        self.let_go_of_latest();
+        while let Some(id) = self.events.keys().next().copied() {
             self.remove_waiting(id);
-            self.report.superseded = self.report.superseded.saturating_add(1);
+            count(&mut self.report.events_dropped);
         }
     }
 
@@ -287,34 +268,25 @@ impl Outbox {
         MessageId(self.next)
     }
 
-    /// Drops the oldest waiting message of the lowest class that has one; `false` when nothing waits.
-    fn drop_one(&mut self) -> bool {
-        let Some((class, id)) =
-            Class::ALL.into_iter().find_map(|class| Some((class, *self.class_set(class).first()?)))
-        else {
-            return false;
-        };
-        self.remove_waiting(id);
-        if let Some(dropped) = self.report.dropped_by_class.get_mut(place(class)) {
-            *dropped = dropped.saturating_add(1);
+    fn let_go_of_latest(&mut self) {
+        while let Some(id) = self.latest.keys().next().copied() {
+            self.remove_waiting(id);
+            count(&mut self.report.superseded);
         }
-        true
     }
 
     fn insert_waiting(&mut self, id: MessageId, entry: Entry) {
         self.count_in(&entry);
-        self.class_set(entry.message.class).insert(id);
         if entry.message.retain {
             self.latest_of.insert(Arc::clone(&entry.message.topic), id);
             self.latest.insert(id, entry);
         } else {
-            self.all.insert(id, entry);
+            self.events.insert(id, entry);
         }
     }
 
     fn remove_waiting(&mut self, id: MessageId) -> Option<Entry> {
-        let entry = self.latest.remove(&id).or_else(|| self.all.remove(&id))?;
-        self.class_set(entry.message.class).remove(&id);
+        let entry = self.latest.remove(&id).or_else(|| self.events.remove(&id))?;
         if entry.message.retain {
             self.latest_of.remove(&entry.message.topic);
         }
@@ -322,34 +294,27 @@ impl Outbox {
         Some(entry)
     }
 
-    fn class_set(&mut self, class: Class) -> &mut BTreeSet<MessageId> {
-        let [sample, status, alarm, event] = &mut self.waiting;
-        match class {
-            Class::Sample => sample,
-            Class::Status => status,
-            Class::Alarm => alarm,
-            Class::Event => event,
+    fn count_in(&mut self, entry: &Entry) {
+        let size = entry.message.size();
+        self.report.messages += 1;
+        self.report.bytes += size;
+        if !entry.message.retain {
+            self.report.held = (self.report.held.0 + 1, self.report.held.1 + size);
         }
     }
 
-    fn count_in(&mut self, entry: &Entry) {
-        self.report.messages += 1;
-        self.report.bytes += entry.message.size();
-    }
-
     fn count_out(&mut self, entry: &Entry) {
+        let size = entry.message.size();
         self.report.messages -= 1;
-        self.report.bytes -= entry.message.size();
+        self.report.bytes -= size;
+        if !entry.message.retain {
+            self.report.held = (self.report.held.0 - 1, self.report.held.1 - size);
+        }
     }
 }
 
-fn place(class: Class) -> usize {
-    match class {
-        Class::Sample => 0,
-        Class::Status => 1,
-        Class::Alarm => 2,
-        Class::Event => 3,
-    }
+fn count(counter: &mut u64) {
+    *counter = counter.saturating_add(1);
 }
 
 #[cfg(test)]
@@ -358,8 +323,8 @@ mod tests {
 
     use super::*;
 
-    fn message(topic: &str, payload: &str, retain: bool, class: Class) -> Message {
-        Message { topic: topic.into(), payload: payload.into(), acknowledged: true, retain, class }
+    fn message(topic: &str, payload: &str, retain: bool) -> Message {
+        Message { topic: topic.into(), payload: payload.into(), at_least_once: true, retain }
     }
 
     fn outbox(messages: usize, window: usize) -> Outbox {
@@ -370,43 +335,51 @@ mod tests {
         std::iter::from_fn(|| outbox.poll_output()).map(|out| out.message.payload.to_string()).collect()
     }
 
-    fn dropped(outbox: &Outbox, class: Class) -> u64 {
-        outbox.report().dropped().find(|(of, _)| *of == class).unwrap().1
-    }
-
     #[test]
     fn of_a_retained_topic_only_the_newest_waits_at_its_place() {
         let mut outbox = outbox(10, 10);
-        outbox.push(message("a", "a1", true, Class::Sample));
-        outbox.push(message("b", "b1", true, Class::Sample));
-        outbox.push(message("a", "a2", true, Class::Sample));
+        outbox.push(message("a", "a1", true));
+        outbox.push(message("b", "b1", true));
+        outbox.push(message("a", "a2", true));
         assert_eq!(drain(&mut outbox), ["a2", "b1"]);
         assert_eq!(outbox.report().superseded, 1);
-        outbox.push(message("a", "a3", true, Class::Sample));
+        outbox.push(message("a", "a3", true));
         assert_eq!(drain(&mut outbox), ["a3"], "what is sent already is not superseded");
     }
 
     #[test]
-    fn a_full_outbox_lets_samples_go_first_then_the_oldest_events() {
+    fn a_full_outbox_lets_the_oldest_events_go_and_nothing_that_is_retained() {
         let mut outbox = outbox(4, 0);
-        outbox.push(message("state", "s", true, Class::Sample));
-        outbox.push(message("health", "h", true, Class::Status));
-        outbox.push(message("alarm", "a", true, Class::Alarm));
+        outbox.push(message("state", "s", true));
+        outbox.push(message("alarm", "a", true));
         for number in 1..=6 {
-            outbox.push(message("event", &format!("e{number}"), false, Class::Event));
+            outbox.push(message("event", &format!("e{number}"), false));
         }
-        outbox.push(message("state", "late", true, Class::Sample));
-        let counts = Class::ALL.map(|class| dropped(&outbox, class));
-        assert_eq!(counts, [2, 1, 1, 2]);
+        outbox.push(message("health", "h", true));
+        assert_eq!(outbox.report().events_dropped, 2);
         outbox.limits.window = 10;
-        assert_eq!(drain(&mut outbox), ["e3", "e4", "e5", "e6"]);
+        assert_eq!(drain(&mut outbox), ["s", "e3", "a", "e4", "h", "e5", "e6"]);
+    }
+
+    #[test]
+    fn what_waits_at_a_stop_is_let_go_and_counted_what_is_sent_may_still_be_acknowledged() {
+        let mut outbox = outbox(10, 1);
+        for (topic, retain) in [("event", false), ("event", false), ("state", true)] {
+            outbox.push(message(topic, "x", retain));
+        }
+        let sent = outbox.poll_output().unwrap();
+        outbox.clear_waiting();
+        assert_eq!((outbox.report().messages, outbox.report().held.0), (1, 0));
+        assert_eq!(outbox.report().events_dropped, 2);
+        outbox.handle_acknowledged(sent.id);
+        assert!(outbox.is_empty());
     }
 
     #[test]
     fn p5_after_a_lost_session_events_come_again_in_order_and_are_marked() {
         let mut outbox = outbox(10, 3);
         for number in 1..=4 {
-            outbox.push(message("event", &format!("e{number}"), false, Class::Event));
+            outbox.push(message("event", &format!("e{number}"), false));
         }
         let sent: Vec<_> = std::iter::from_fn(|| outbox.poll_output()).collect();
         assert!(sent.iter().all(|out| !out.again));
@@ -425,17 +398,17 @@ mod tests {
     fn p6_what_is_live_takes_turns_with_the_backlog() {
         let mut outbox = outbox(100, 100);
         for number in 1..=3 {
-            outbox.push(message("event", &format!("e{number}"), false, Class::Event));
+            outbox.push(message("event", &format!("e{number}"), false));
         }
-        outbox.push(message("a", "live1", true, Class::Sample));
-        outbox.push(message("b", "live2", true, Class::Sample));
+        outbox.push(message("a", "live1", true));
+        outbox.push(message("b", "live2", true));
         assert_eq!(drain(&mut outbox), ["live1", "e1", "live2", "e2", "e3"]);
     }
 
     #[test]
     fn a_message_that_no_broker_takes_is_counted_and_thrown_away() {
         let mut outbox = outbox(10, 10);
-        outbox.push(message("event", &"x".repeat(2000), false, Class::Event));
+        outbox.push(message("event", &"x".repeat(2000), false));
         assert!(outbox.is_empty());
         assert_eq!(outbox.report().too_large, 1);
     }
@@ -444,7 +417,9 @@ mod tests {
     fn the_forecast_is_what_is_free_over_the_mean_rate() {
         let mut outbox = outbox(110, 0);
         assert_eq!(outbox.report().hours_left(3600), None);
-        (0..10).for_each(|_| outbox.push(message("event", "x", false, Class::Event)));
+        for _ in 0..10 {
+            outbox.push(message("event", "x", false));
+        }
         assert_eq!(outbox.report().hours_left(3600), Some(10.0));
     }
 
@@ -465,16 +440,9 @@ mod tests {
         ]
     }
 
-    /// Topics 0 and 1 are events, the others retained, one of each class.
-    fn topic_class(topic: usize) -> (bool, Class) {
-        [
-            (false, Class::Event),
-            (false, Class::Event),
-            (true, Class::Event),
-            (true, Class::Alarm),
-            (true, Class::Status),
-            (true, Class::Sample),
-        ][topic]
+    /// Topics 0 and 1 are events, the others retained.
+    fn is_retained(topic: usize) -> bool {
+        topic >= 2
     }
 
     proptest! {
@@ -496,9 +464,8 @@ mod tests {
                 match step {
                     Step::Push { topic, size } => {
                         pushed += 1;
-                        let (retain, class) = topic_class(topic);
                         let payload = format!("{pushed:0size$}");
-                        outbox.push(message(&topic.to_string(), &payload, retain, class));
+                        outbox.push(message(&topic.to_string(), &payload, is_retained(topic)));
                     }
                     Step::Send => {
                         if let Some(out) = outbox.poll_output() {
@@ -525,18 +492,20 @@ mod tests {
                     }
                 }
                 let report = *outbox.report();
-                let waiting = outbox.all.len() + outbox.latest.len();
+                let waiting = outbox.events.len() + outbox.latest.len();
                 prop_assert_eq!(report.messages, waiting + outbox.in_flight.len());
-                prop_assert_eq!(outbox.waiting.iter().map(BTreeSet::len).sum::<usize>(), waiting);
                 prop_assert_eq!(outbox.latest_of.len(), outbox.latest.len());
-                let bytes = outbox.all.values().chain(outbox.latest.values()).chain(outbox.in_flight.values());
-                prop_assert_eq!(report.bytes, bytes.map(|entry| entry.message.size()).sum::<usize>());
-                prop_assert!(report.messages <= messages.max(window) && report.bytes <= 250);
-                let gone: u64 = report.dropped().map(|(_, dropped)| dropped).sum();
+                let all = || outbox.events.values().chain(outbox.latest.values()).chain(outbox.in_flight.values());
+                prop_assert_eq!(report.bytes, all().map(|entry| entry.message.size()).sum::<usize>());
+                let events = || all().filter(|entry| !entry.message.retain);
+                prop_assert_eq!(report.held.0, events().count());
+                prop_assert_eq!(report.held.1, events().map(|entry| entry.message.size()).sum::<usize>());
+                prop_assert!(report.held.0 <= messages.max(window) && report.held.1 <= 250);
+                prop_assert!(outbox.latest.len() <= 4, "one for each retained topic");
                 let left = u64::try_from(report.messages).unwrap();
                 prop_assert_eq!(
                     pushed,
-                    report.acknowledged + report.superseded + report.too_large + gone + left
+                    report.acknowledged + report.superseded + report.too_large + report.events_dropped + left
                 );
             }
         }

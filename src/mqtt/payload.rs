@@ -2,7 +2,7 @@
 
 use super::json::{JsonWriter, is_representable};
 use super::outbox::OutboxReport;
-use crate::mapping::{AlarmDef, TagDef, TagTable};
+use crate::mapping::{AlarmDef, Objection, TagDef, TagTable};
 use crate::process_image::{
     AlarmStatus, Event, NmtState, NodeIndex, NodeStatus, Priority, ProcessImage, Quality, Sample, TagIndex,
     Value,
@@ -38,8 +38,6 @@ pub const ONLINE: &str = r#"{"state":"online"}"#;
 /// `bridge/state` when the gateway stopped, or by last will.
 pub const OFFLINE: &str = r#"{"state":"offline"}"#;
 
-/// Reason of a value that its own device calls meaningless: the tag that tells so is false (R-DET-086).
-pub const NOT_VALID: &str = "not_valid";
 /// Reason of a value that is no number.
 pub const NOT_A_NUMBER: &str = "not_a_number";
 
@@ -62,7 +60,7 @@ pub fn state(out: &mut String, table: &TagTable, image: &ProcessImage, node: Nod
     json.optional_text("nmt", status.and_then(|status| status.nmt).map(NmtState::word));
     json.nested("tags", |tags| {
         for (tag, sample) in published() {
-            tags.value(&tag.name, shown(sample, def.zero_on_bad), tag.decimals);
+            tags.value(&tag.name, sample.shown(def.zero_on_bad), tag.decimals);
         }
     });
     json.nested("bad", |bad| {
@@ -75,30 +73,10 @@ pub fn state(out: &mut String, table: &TagTable, image: &ProcessImage, node: Nod
     json.finish();
 }
 
-/// The value to show: nothing where nothing was ever received; the last one otherwise, or 0 where the installation
-/// asks for it (R-DET-084).
-fn shown(sample: &Sample, zero_on_bad: bool) -> Option<Value> {
-    if sample.quality.is_usable() {
-        Some(sample.value)
-    } else if zero_on_bad {
-        Some(match sample.value {
-            Value::Bool(_) => Value::Bool(false),
-            Value::Unsigned(_) | Value::Signed(_) | Value::Float(_) => Value::Unsigned(0),
-        })
-    } else {
-        sample.received_at.map(|_| sample.value)
-    }
-}
-
 /// Why a value should not be used as it stands; `None` for a good one.
 fn reason(image: &ProcessImage, tag: &TagDef, sample: &Sample) -> Option<&'static str> {
-    if let Some(reason) = sample.quality.reason() {
-        return Some(reason.word());
-    }
-    if tag.valid.is_some_and(|valid| !image.tag(valid).value.is_true()) {
-        return Some(NOT_VALID);
-    }
-    (!is_representable(sample.value)).then_some(NOT_A_NUMBER)
+    let objection = tag.objection(image, sample).map(Objection::word);
+    objection.or_else(|| (!is_representable(sample.value)).then_some(NOT_A_NUMBER))
 }
 
 /// `<node>/availability`.
@@ -126,7 +104,7 @@ pub fn alarm(out: &mut String, table: &TagTable, def: &AlarmDef, status: &AlarmS
     json.optional_integer("ts", status.since.map(Timestamp::as_millis));
     json.integer("count", status.count);
     json.bool("first_out", status.first_out);
-    json.value("value", status.value, decimals_of(table, def.value));
+    json.value("value", status.value, table.decimals(def.value));
     json.text("text", &def.text);
     json.text("action", &def.action);
     json.finish();
@@ -147,7 +125,7 @@ pub fn event(out: &mut String, table: &TagTable, event: &Event, sid: &str) {
     json.text("from", &event.from);
     json.text("to", &event.to);
     json.optional_text("priority", event.priority.map(Priority::word));
-    json.value("value", event.value, decimals_of(table, alarm.and_then(|alarm| alarm.value)));
+    json.value("value", event.value, table.decimals(alarm.and_then(|alarm| alarm.value)));
     json.text("text", &event.text);
     json.finish();
 }
@@ -169,11 +147,6 @@ pub fn events_missed(out: &mut String, sid: &str, last: u64, missed: u64, at: Ti
     json.integer("value", missed);
     json.text("text", "More events came at once than the journal holds; the oldest were lost.");
     json.finish();
-}
-
-/// Digits after the decimal point of an alarm's value.
-fn decimals_of(table: &TagTable, tag: Option<TagIndex>) -> u8 {
-    tag.and_then(|tag| table.tag(tag)).map_or(3, |tag| tag.decimals)
 }
 
 /// `bridge/info`: what this gateway is and what belongs to it.
@@ -240,13 +213,9 @@ pub fn health(
                 let percent = bus.load_permille.map(|permille| Value::Float(f64::from(permille) / 10.0));
                 json.value("load_percent", percent, 1);
                 json.integer("frames_per_second", bus.frames_per_second);
-                json.integer("frames_received", bus.frames_received);
-                json.integer("frames_sent", bus.frames_sent);
-                json.integer("frames_not_sent", bus.frames_not_sent);
-                json.integer("errors", bus.errors);
-                json.integer("bus_off_count", bus.bus_off_count);
-                json.integer("overruns", bus.overruns);
-                json.integer("foreign_frames", bus.foreign_frames);
+                for (name, _, count) in bus.named() {
+                    json.integer(name, count);
+                }
             });
         }
     });
@@ -268,7 +237,7 @@ fn outbox_members(json: &mut JsonWriter<'_>, outbox: &OutboxReport, uptime_s: u6
     json.integer("events_missed", outbox.events_missed);
     json.nested("dropped", |json| {
         for (class, dropped) in outbox.dropped() {
-            json.integer(class.word(), dropped);
+            json.integer(class, dropped);
         }
     });
 }

@@ -10,13 +10,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::outbox::{Class, Limits, Message, MessageId, Outbox, OutboxReport, Outgoing};
+use super::outbox::{Limits, Message, MessageId, Outbox, OutboxReport, Outgoing};
 use super::payload::{self, Identity, Stamp};
 use super::settings::{MqttSettings, StateQos};
 use super::topics::Topics;
 use crate::mapping::{NodeDef, TagTable};
 use crate::process_image::{
-    AlarmStatus, Event, NmtState, NodeIndex, ProcessImage, Quality, Revision, TagIndex, Value,
+    AlarmStatus, NmtState, NodeIndex, ProcessImage, Quality, Revision, TagIndex, Value,
 };
 use crate::time::{Instant, Now};
 
@@ -24,6 +24,8 @@ use crate::time::{Instant, Now};
 const HEALTH_INTERVAL: Duration = Duration::from_secs(30);
 /// Payloads made under one lock of the image; the rest follows under the next.
 const MOST_PER_READ: usize = 32;
+/// Events taken from the journal under one lock of the image; the rest follows under the next.
+const MOST_EVENTS_PER_READ: usize = 128;
 /// Bytes of one message: what brokers take unless told otherwise is far more.
 pub const LARGEST_MESSAGE: usize = 256 * 1024;
 
@@ -40,6 +42,8 @@ pub struct Publisher {
     nodes: Vec<NodeState>,
     /// What was last published of each tag, by [`TagIndex`].
     tags: Vec<Option<(Value, Quality)>>,
+    /// Whether a change of the tag changes the payload: it is published, or tells whether one that is means anything.
+    watched: Vec<bool>,
     /// What was last published of each alarm.
     alarms: Vec<Option<AlarmStatus>>,
     seen: Option<Revision>,
@@ -48,6 +52,12 @@ pub struct Publisher {
     next_health: Instant,
     /// Work was left for the next call because of [`MOST_PER_READ`].
     more: bool,
+    /// Events were left in the journal because of [`MOST_EVENTS_PER_READ`].
+    more_events: bool,
+    /// `offline`, once the gateway stops.
+    farewell: Option<MessageId>,
+    /// The broker has it.
+    farewell_acknowledged: bool,
     buffer: String,
 }
 
@@ -97,11 +107,15 @@ impl Publisher {
             birth: Birth::Due,
             nodes: vec![NodeState::default(); table.nodes.len()],
             tags: vec![None; table.tags.len()],
+            watched: watched(&table),
             alarms: vec![None; table.alarms.len()],
             seen: None,
             cursor: 0,
             next_health: Instant::START,
             more: false,
+            more_events: false,
+            farewell: None,
+            farewell_acknowledged: false,
             buffer: String::new(),
             table,
         }
@@ -134,6 +148,7 @@ impl Publisher {
 
     /// The broker has a message.
     pub fn handle_acknowledged(&mut self, id: MessageId) {
+        self.farewell_acknowledged |= self.farewell == Some(id);
         self.outbox.handle_acknowledged(id);
     }
 
@@ -148,7 +163,7 @@ impl Publisher {
         let mut left = MOST_PER_READ;
         if self.birth == Birth::Due {
             payload::info(&mut self.buffer, &self.table, &self.identity);
-            self.push(Arc::clone(&self.topics.bridge_info), true, true, Class::Status);
+            self.push(Arc::clone(&self.topics.bridge_info), true, true);
             self.next_health = now.instant;
             self.birth = Birth::Nodes;
         }
@@ -159,18 +174,17 @@ impl Publisher {
         self.publish_nodes(now, image, &mut left);
         self.seen = if self.more { None } else { Some(image.revision) };
         if self.birth == Birth::Nodes && !self.more {
-            self.buffer.clear();
-            self.buffer.push_str(payload::ONLINE);
-            self.push(Arc::clone(&self.topics.bridge_state), true, true, Class::Status);
+            self.publish_bridge_state(payload::ONLINE);
             self.birth = Birth::Done;
         }
     }
 
-    /// The gateway stops in good order: the last message of the session.
+    /// The gateway stops in good order: what waits is given up, and `offline` is the last message of the session.
     pub fn handle_stop(&mut self) {
-        self.buffer.clear();
-        self.buffer.push_str(payload::OFFLINE);
-        self.push(Arc::clone(&self.topics.bridge_state), true, true, Class::Status);
+        self.more = false;
+        self.more_events = false;
+        self.outbox.clear_waiting();
+        self.farewell = self.publish_bridge_state(payload::OFFLINE);
     }
 
     /// The next message to send; call until `None`.
@@ -181,6 +195,9 @@ impl Publisher {
     /// When [`handle_image`](Self::handle_image) is to be called at the latest.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
+        if self.more_events {
+            return Some(Instant::START);
+        }
         if !self.session {
             return None;
         }
@@ -203,32 +220,39 @@ impl Publisher {
         self.outbox.in_flight()
     }
 
+    /// Whether the image holds more than one read takes: [`handle_image`](Self::handle_image) is to be called again.
+    #[must_use]
+    pub fn has_more(&self) -> bool {
+        self.more || self.more_events
+    }
+
     /// Whether everything that was to be told has been acknowledged.
     #[must_use]
     pub fn is_idle(&self) -> bool {
-        self.outbox.is_empty() && !self.more
+        self.outbox.is_empty() && !self.has_more()
+    }
+
+    /// Whether the broker has the `offline` of [`handle_stop`](Self::handle_stop).
+    #[must_use]
+    pub fn has_said_farewell(&self) -> bool {
+        self.farewell_acknowledged
     }
 
     fn collect_events(&mut self, image: &ProcessImage) {
-        if image.journal.newest() <= self.cursor {
-            return;
-        }
-        let (events, missed) = image.journal.after(self.cursor);
-        if let (Some(oldest), true) = (events.first(), missed > 0) {
+        let (events, missed) = image.journal.since(self.cursor);
+        let mut events = events.take(MOST_EVENTS_PER_READ).peekable();
+        if let (Some(oldest), true) = (events.peek(), missed > 0) {
             self.outbox.count_missed(missed);
             let last = oldest.seq.saturating_sub(1);
             payload::events_missed(&mut self.buffer, &self.identity.sid, last, missed, oldest.ts);
-            self.push(Arc::clone(&self.topics.event), true, false, Class::Event);
+            self.push(Arc::clone(&self.topics.event), true, false);
         }
-        for event in &events {
-            self.publish_event(event);
+        for event in events {
+            payload::event(&mut self.buffer, &self.table, event, &self.identity.sid);
+            self.push(Arc::clone(&self.topics.event), true, false);
+            self.cursor = event.seq;
         }
-        self.cursor = image.journal.newest();
-    }
-
-    fn publish_event(&mut self, event: &Event) {
-        payload::event(&mut self.buffer, &self.table, event, &self.identity.sid);
-        self.push(Arc::clone(&self.topics.event), true, false, Class::Event);
+        self.more_events = self.cursor < image.journal.newest();
     }
 
     fn publish_health(&mut self, now: Now, image: &ProcessImage) {
@@ -238,7 +262,17 @@ impl Publisher {
         self.next_health = now.instant + HEALTH_INTERVAL;
         let report = *self.outbox.report();
         payload::health(&mut self.buffer, &self.table, image, &self.identity, now, &report);
-        self.push(Arc::clone(&self.topics.bridge_health), true, true, Class::Status);
+        self.push(Arc::clone(&self.topics.bridge_health), true, true);
+        if self.birth == Birth::Done {
+            // The last will of a session before this one may have come late.
+            self.publish_bridge_state(payload::ONLINE);
+        }
+    }
+
+    fn publish_bridge_state(&mut self, state: &str) -> Option<MessageId> {
+        self.buffer.clear();
+        self.buffer.push_str(state);
+        self.push(Arc::clone(&self.topics.bridge_state), true, true)
     }
 
     fn publish_alarms(&mut self, image: &ProcessImage, left: &mut usize) {
@@ -253,7 +287,7 @@ impl Publisher {
             }
             payload::alarm(&mut self.buffer, &table, def, status);
             if let Some(topic) = self.topics.alarms.get(place).cloned() {
-                self.push(topic, true, true, Class::Alarm);
+                self.push(topic, true, true);
             }
             if let Some(told) = self.alarms.get_mut(place) {
                 *told = Some(*status);
@@ -296,7 +330,7 @@ impl Publisher {
         payload::availability(&mut self.buffer, status);
         if let Some(topics) = self.topics.nodes.get(place) {
             let topic = Arc::clone(&topics.availability);
-            self.push(topic, true, true, Class::Status);
+            self.push(topic, true, true);
         }
         if let Some(node) = self.nodes.get_mut(place) {
             node.availability = Some((status.online, status.reason.clone()));
@@ -304,7 +338,7 @@ impl Publisher {
         true
     }
 
-    /// Marks a node whose published values, qualities or NMT state are not those that were told.
+    /// Marks a node whose published values, what is to be said against them, or NMT state are not those that were told.
     fn note_changes(&mut self, place: usize, def: &NodeDef, image: &ProcessImage) {
         let table = &self.table;
         let Some(node) = self.nodes.get_mut(place) else { return };
@@ -316,9 +350,13 @@ impl Publisher {
             return;
         }
         let told = self.tags.get(def.tags.clone()).unwrap_or_default();
-        let tags = def.tags.clone().map(TagIndex).zip(table.tags.get(def.tags.clone()).unwrap_or_default());
-        let moved = tags.zip(told).filter(|((_, tag), _)| tag.published).any(|((index, tag), told)| {
-            let sample = image.tag(index);
+        let watched = self.watched.get(def.tags.clone()).unwrap_or_default();
+        let tags = table.tags.get(def.tags.clone()).unwrap_or_default().iter().zip(told).zip(watched);
+        let moved = def.tags.clone().zip(tags).any(|(index, ((tag, told), watched))| {
+            if !watched {
+                return false;
+            }
+            let sample = image.tag(TagIndex(index));
             told.is_none_or(|(value, quality)| {
                 quality != sample.quality || differs(value, sample.value, tag.deadband)
             })
@@ -340,7 +378,7 @@ impl Publisher {
         }
         if let Some(topics) = self.topics.nodes.get(place) {
             let topic = Arc::clone(&topics.state);
-            self.push(topic, self.state_acknowledged, true, Class::Sample);
+            self.push(topic, self.state_acknowledged, true);
         }
     }
 
@@ -352,9 +390,9 @@ impl Publisher {
     }
 
     /// Puts what stands in the buffer into the outbox.
-    fn push(&mut self, topic: Arc<str>, acknowledged: bool, retain: bool, class: Class) {
+    fn push(&mut self, topic: Arc<str>, at_least_once: bool, retain: bool) -> Option<MessageId> {
         let payload = Arc::from(self.buffer.as_str());
-        self.outbox.push(Message { topic, payload, acknowledged, retain, class });
+        self.outbox.push(Message { topic, payload, at_least_once, retain })
     }
 }
 
@@ -370,6 +408,17 @@ impl NodeState {
         };
         published + interval.min(publish.max_interval)
     }
+}
+
+/// Of each tag: whether it is published, or tells whether a published one means anything.
+fn watched(table: &TagTable) -> Vec<bool> {
+    let mut watched: Vec<bool> = table.tags.iter().map(|tag| tag.published).collect();
+    for validity in table.tags.iter().filter(|tag| tag.published).filter_map(|tag| tag.valid) {
+        if let Some(watched) = watched.get_mut(validity.0) {
+            *watched = true;
+        }
+    }
+    watched
 }
 
 /// Whether two reports of an alarm say the same; a value that is no number equals itself here.

@@ -38,7 +38,8 @@ pub struct MqttSettings {
     /// User name; none unless given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub username: Option<String>,
-    /// File whose first line is the password; read at each attempt, so that a changed password needs no restart.
+    /// File whose first line is the password; read at each attempt, so that a changed password needs no restart. Only with
+    /// `username`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub password_file: Option<PathBuf>,
     /// Keep alive in seconds, 5..=3600: a link that died without a word is noticed within one and a half times this.
@@ -56,11 +57,12 @@ pub struct MqttSettings {
     #[serde(deserialize_with = "inflight")]
     #[schemars(range(min = 1, max = 1000))]
     pub inflight: u16,
-    /// Most messages that wait while the broker is away or slow, 100..=1,000,000. Samples go first, then the oldest events.
+    /// Most events that wait while the broker is away or slow, 100..=1,000,000; beyond it the oldest leave. Retained
+    /// messages do not count: of each topic only the newest waits.
     #[serde(deserialize_with = "outbox_messages")]
     #[schemars(range(min = 100, max = 1_000_000))]
     pub outbox_messages: usize,
-    /// Most bytes (topics and payloads) that wait, 65,536..=1,073,741,824. The same order of leaving.
+    /// Most bytes of such events (topics and payloads), 65,536..=1,073,741,824.
     #[serde(deserialize_with = "outbox_bytes")]
     #[schemars(range(min = 65_536, max = 1_073_741_824))]
     pub outbox_bytes: usize,
@@ -89,6 +91,18 @@ impl MqttSettings {
     #[must_use]
     pub fn client_id_for(&self, gateway: &str) -> String {
         self.client_id.clone().unwrap_or_else(|| format!("cangate-{gateway}"))
+    }
+
+    /// What does not fit together, each with the key within `[mqtt]` that it is about, and a hint.
+    #[must_use]
+    pub fn problems(&self) -> Vec<(&'static str, &'static str, &'static str)> {
+        let lonely = self.password_file.is_some() && self.username.is_none();
+        let password = (
+            "password_file",
+            "a password without a `username` would not be sent: MQTT 3.1.1 has no such session",
+            "add `username`, or take `password_file` away",
+        );
+        lonely.then_some(password).into_iter().collect()
     }
 }
 

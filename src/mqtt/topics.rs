@@ -4,7 +4,6 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 
 use crate::mapping::{AlarmDef, AlarmOwner, TagTable};
-use crate::process_image::NodeIndex;
 
 /// Every topic of one gateway, made once.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -17,7 +16,7 @@ pub struct Topics {
     pub bridge_health: Arc<str>,
     /// `event`: what happened.
     pub event: Arc<str>,
-    /// By [`NodeIndex`].
+    /// By [`NodeIndex`](crate::process_image::NodeIndex).
     pub nodes: Vec<NodeTopics>,
     /// By [`AlarmIndex`](crate::process_image::AlarmIndex).
     pub alarms: Vec<Arc<str>>,
@@ -51,12 +50,6 @@ impl Topics {
             alarms: table.alarms.iter().map(|alarm| topic(&alarm_path(table, alarm))).collect(),
         }
     }
-}
-
-/// `<base>/<gateway>/<node>/state`, for register maps that name the topic of a tag.
-#[must_use]
-pub fn node_state(base: &str, table: &TagTable, node: NodeIndex) -> Option<String> {
-    Some(format!("{base}/{}/{}/state", level(&table.gateway), level(&table.node(node)?.name)))
 }
 
 /// The path of an alarm below the gateway's prefix.

@@ -83,6 +83,17 @@ pub enum SessionError {
     Silent(Duration),
 }
 
+impl SessionError {
+    /// Whether both are to be mended in the same way; the words may differ.
+    #[must_use]
+    pub fn is_kind_of(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Refused(one), Self::Refused(other)) => one == other,
+            _ => std::mem::discriminant(self) == std::mem::discriminant(other),
+        }
+    }
+}
+
 /// What happens in a session.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Happening {
@@ -162,7 +173,7 @@ impl Uplink for RumqttcSession {
     fn send(&mut self, outgoing: &Outgoing) -> bool {
         let Some(client) = &self.client else { return false };
         let message = &outgoing.message;
-        let qos = if message.acknowledged { QoS::AtLeastOnce } else { QoS::AtMostOnce };
+        let qos = if message.at_least_once { QoS::AtLeastOnce } else { QoS::AtMostOnce };
         let options = PublishOptions::new(qos).retain(message.retain);
         let Ok(notice) = client.try_publish_tracked(&*message.topic, &*message.payload, options) else {
             return false;

@@ -1,6 +1,5 @@
 //! What the gateway is told about the rest of the program: the MQTT session and the clock. \[IO\]
 
-use std::path::Path;
 use std::time::Duration;
 
 use tokio::sync::watch;
@@ -17,9 +16,8 @@ const SYNCHRONISED: &str = "/run/systemd/timesync/synchronized";
 const CLOCK_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Whether the clock is known to be synchronised.
-#[must_use]
-pub fn clock_is_synchronised() -> bool {
-    Path::new(SYNCHRONISED).exists()
+async fn clock_is_synchronised() -> bool {
+    tokio::fs::try_exists(SYNCHRONISED).await.unwrap_or(false)
 }
 
 /// Keeps `health` up to date until `stop`. `mqtt` is `None` where MQTT is not configured.
@@ -28,25 +26,57 @@ pub async fn run(
     health: watch::Sender<Health>,
     stop: CancellationToken,
 ) {
+    let mut clock = tokio::time::interval(CLOCK_INTERVAL);
+    let mut now = Health {
+        mqtt_connected: mqtt.as_ref().map(|session| session.borrow().connected),
+        ..Health::default()
+    };
     loop {
-        let now = Health {
-            mqtt_connected: mqtt.as_mut().map(|session| session.borrow_and_update().connected),
-            clock_synchronised: clock_is_synchronised(),
-        };
-        health.send_if_modified(|seen| std::mem::replace(seen, now) != now);
+        // Every message moves the counters of the session; here only whether there is one counts.
         let session_changed = async {
-            let gone = match &mut mqtt {
-                Some(session) => session.changed().await.is_err(),
-                None => true,
+            let shown = now.mqtt_connected;
+            let seen = match &mut mqtt {
+                Some(session) => {
+                    let changed = session.wait_for(|session| Some(session.connected) != shown).await;
+                    changed.ok().map(|session| session.connected)
+                }
+                None => None,
             };
-            if gone {
-                std::future::pending::<()>().await;
+            match seen {
+                Some(connected) => connected,
+                None => std::future::pending().await,
             }
         };
         tokio::select! {
             () = stop.cancelled() => return,
-            () = tokio::time::sleep(CLOCK_INTERVAL) => {}
-            () = session_changed => {}
+            _ = clock.tick() => now.clock_synchronised = clock_is_synchronised().await,
+            connected = session_changed => now.mqtt_connected = Some(connected),
         }
+        health.send_if_modified(|told| std::mem::replace(told, now) != now);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn only_the_beginning_and_the_end_of_a_session_are_told() {
+        let (session, seen) = watch::channel(MqttStatus::default());
+        let (health, mut told) = watch::channel(Health::default());
+        let stop = CancellationToken::new();
+        let task = tokio::spawn(run(Some(seen), health, stop.clone()));
+        told.wait_for(|health| health.mqtt_connected == Some(false)).await.unwrap();
+        session.send_modify(|status| status.connected = true);
+        told.wait_for(|health| health.mqtt_connected == Some(true)).await.unwrap();
+        for _ in 0..100 {
+            session.send_modify(|status| status.outbox.sent += 1);
+            tokio::task::yield_now().await;
+        }
+        assert!(!told.has_changed().unwrap(), "messages are no news");
+        session.send_modify(|status| status.connected = false);
+        told.wait_for(|health| health.mqtt_connected == Some(false)).await.unwrap();
+        stop.cancel();
+        task.await.unwrap();
     }
 }

@@ -64,7 +64,7 @@ fn mqtt_readings(status: &MqttStatus) -> Vec<Reading> {
         ),
     ];
     for (class, count) in outbox.dropped() {
-        let labels = vec![("class", class.word().to_owned())];
+        let labels = vec![("class", class.to_owned())];
         let help = "Messages dropped because the outbox was full, by class";
         readings.push(Reading { labels, ..counter("mqtt_dropped", help, count) });
     }

@@ -48,6 +48,8 @@ pub enum Control {
 #[derive(Debug, Default)]
 pub struct Seen {
     pub connections: usize,
+    /// Of those: over.
+    pub closed: usize,
     pub messages: Vec<Received>,
     pub control: Vec<(usize, Control)>,
 }
@@ -75,7 +77,10 @@ impl FakeBroker {
                 };
                 let script = scripts[number.min(scripts.len() - 1)].clone();
                 let seen = Arc::clone(&shared);
-                connections.spawn(async move { serve(stream, number, script, &seen).await });
+                connections.spawn(async move {
+                    serve(stream, number, script, &seen).await;
+                    seen.lock().unwrap().closed += 1;
+                });
             }
         });
         Self { address, seen, task }
