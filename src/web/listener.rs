@@ -1,55 +1,73 @@
-//! Accepts connections \[IO\], within limits: so many at once, none of them silent for long.
+//! Accepts connections \[IO\], within limits: so many at once, none of them silent for long, none that takes for ever to
+//! ask. A newcomer always gets in: a watchdog that asks `/livez` cannot be kept out by others who only sit there.
 
 use std::future::Future;
 use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
+use nix::errno::Errno;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::Sleep;
+use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
-/// Connections at once; more wait in the system's queue until one ends.
+use crate::slots::{Activity, SlotId, Slots};
+use crate::time::Clock;
+
+/// Connections at once; when all are in use, one of them makes room for a newcomer ([`Slots`]).
 const MOST_CONNECTIONS: usize = 64;
 /// A connection that neither sends nor takes anything for this long is closed.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(30);
+/// From the first byte of a request, or from the beginning of the connection, until its answer begins.
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pause after a failed accept, for example when there are no file descriptors left.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+type Places = Arc<Mutex<Slots<CancellationToken>>>;
 
 /// A listener with a limit.
 #[derive(Debug)]
 pub struct LimitedListener {
     listener: TcpListener,
-    slots: Arc<Semaphore>,
+    places: Places,
+    clock: Clock,
 }
 
 impl LimitedListener {
     /// Over a bound socket.
     #[must_use]
-    pub fn new(listener: TcpListener) -> Self {
-        Self { listener, slots: Arc::new(Semaphore::new(MOST_CONNECTIONS)) }
+    pub fn new(listener: TcpListener, clock: Clock) -> Self {
+        Self { listener, places: Arc::new(Mutex::new(Slots::new(MOST_CONNECTIONS))), clock }
+    }
+
+    fn admit(&self, stream: TcpStream, peer: SocketAddr) -> Connection<TcpStream> {
+        let _ = stream.set_nodelay(true);
+        let place = Place::take(&self.places, peer);
+        Connection::new(stream, place, self.clock)
     }
 }
 
 impl axum::serve::Listener for LimitedListener {
-    type Io = Connection;
+    type Io = Connection<TcpStream>;
     type Addr = SocketAddr;
 
-    async fn accept(&mut self) -> (Connection, SocketAddr) {
+    async fn accept(&mut self) -> (Self::Io, SocketAddr) {
         loop {
-            let slot = Arc::clone(&self.slots).acquire_owned().await;
-            match (slot, self.listener.accept().await) {
-                (Ok(slot), Ok((stream, peer))) => return (Connection::new(stream, slot), peer),
-                (_, Err(error)) => {
+            match self.listener.accept().await {
+                Ok((stream, peer)) => return (self.admit(stream, peer), peer),
+                Err(error) => {
                     tracing::debug!("cannot accept an HTTP connection: {error}");
+                    let code = error.raw_os_error().map(Errno::from_raw);
+                    if matches!(code, Some(Errno::EMFILE | Errno::ENFILE)) {
+                        let other = lock(&self.places).evict();
+                        other.inspect(CancellationToken::cancel);
+                    }
                     tokio::time::sleep(ACCEPT_PAUSE).await;
                 }
-                // The semaphore is never closed.
-                (Err(_), Ok(_)) => tokio::time::sleep(ACCEPT_PAUSE).await,
             }
         }
     }
@@ -59,49 +77,118 @@ impl axum::serve::Listener for LimitedListener {
     }
 }
 
-/// A connection that ends by itself when nothing moves.
+fn lock(places: &Places) -> std::sync::MutexGuard<'_, Slots<CancellationToken>> {
+    places.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// A place among the connections; free again when dropped.
 #[derive(Debug)]
-pub struct Connection {
-    stream: TcpStream,
+struct Place {
+    id: SlotId,
+    activity: Arc<Activity>,
+    evicted: CancellationToken,
+    places: Places,
+}
+
+impl Place {
+    fn take(places: &Places, peer: SocketAddr) -> Self {
+        let evicted = CancellationToken::new();
+        let taken = lock(places).take(peer.ip(), evicted.clone());
+        taken.evicted.inspect(CancellationToken::cancel);
+        Self { id: taken.id, activity: taken.activity, evicted, places: Arc::clone(places) }
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        lock(&self.places).release(self.id);
+    }
+}
+
+/// A connection that ends by itself when nothing moves, when a request takes too long, and when it has to make room.
+#[derive(Debug)]
+pub struct Connection<S> {
+    stream: S,
+    place: Place,
+    clock: Clock,
+    /// Ends when nothing has moved for too long.
     idle: Pin<Box<Sleep>>,
-    _slot: OwnedSemaphorePermit,
+    /// Ends when the answer should have begun; counts only while `asking`.
+    request: Pin<Box<Sleep>>,
+    /// A request is expected or under way; `false` from its answer on, until the next byte comes.
+    asking: bool,
+    evicted: Pin<Box<WaitForCancellationFutureOwned>>,
 }
 
-impl Connection {
-    fn new(stream: TcpStream, slot: OwnedSemaphorePermit) -> Self {
-        let _ = stream.set_nodelay(true);
-        Self { stream, idle: Box::pin(tokio::time::sleep(IDLE_TIMEOUT)), _slot: slot }
+impl<S> Connection<S> {
+    fn new(stream: S, place: Place, clock: Clock) -> Self {
+        let sleep = |patience| Box::pin(tokio::time::sleep(patience));
+        let evicted = Box::pin(place.evicted.clone().cancelled_owned());
+        let (idle, request) = (sleep(IDLE_TIMEOUT), sleep(REQUEST_TIMEOUT));
+        Self { stream, place, clock, idle, request, asking: true, evicted }
     }
 
-    /// What the stream says; when it has nothing, whether the patience is over.
-    fn watched<T>(&mut self, context: &mut Context<'_>, polled: Poll<io::Result<T>>) -> Poll<io::Result<T>> {
-        if polled.is_ready() {
-            self.idle = Box::pin(tokio::time::sleep(IDLE_TIMEOUT));
-            return polled;
+    /// Whether the connection has to end now. Wakes the task when it has to end later.
+    fn is_over(&mut self, context: &mut Context<'_>) -> bool {
+        let late = self.asking && self.request.as_mut().poll(context).is_ready();
+        late || self.evicted.as_mut().poll(context).is_ready() || self.idle.as_mut().poll(context).is_ready()
+    }
+
+    /// Something moved.
+    fn moved(&mut self) {
+        let deadline = self.clock.deadline(self.clock.now().instant + IDLE_TIMEOUT);
+        self.idle.as_mut().reset(deadline);
+    }
+
+    /// A byte of a request came.
+    fn asked(&mut self) {
+        if !self.asking {
+            self.asking = true;
+            let deadline = self.clock.deadline(self.clock.now().instant + REQUEST_TIMEOUT);
+            self.request.as_mut().reset(deadline);
         }
-        self.idle.as_mut().poll(context).map(|()| Err(io::ErrorKind::TimedOut.into()))
+    }
+
+    /// The answer began: so there was a whole request.
+    fn answered(&mut self) {
+        self.asking = false;
+        self.place.activity.touch(self.clock.now().instant);
     }
 }
 
-impl AsyncRead for Connection {
+fn over<T>() -> Poll<io::Result<T>> {
+    Poll::Ready(Err(io::ErrorKind::TimedOut.into()))
+}
+
+impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
         let polled = Pin::new(&mut self.stream).poll_read(context, buffer);
-        self.watched(context, polled)
+        if polled.is_ready() {
+            self.moved();
+            self.asked();
+        }
+        // Also when there was something to read: who sends a byte now and then gets no longer for it.
+        if self.is_over(context) { over() } else { polled }
     }
 }
 
-impl AsyncWrite for Connection {
+impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
     fn poll_write(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
         bytes: &[u8],
     ) -> Poll<io::Result<usize>> {
         let polled = Pin::new(&mut self.stream).poll_write(context, bytes);
-        self.watched(context, polled)
+        self.answered();
+        if polled.is_ready() {
+            self.moved();
+            return polled;
+        }
+        if self.is_over(context) { over() } else { polled }
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
@@ -110,5 +197,63 @@ impl AsyncWrite for Connection {
 
     fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
         Pin::new(&mut self.stream).poll_shutdown(context)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream};
+
+    use super::*;
+
+    fn connection() -> (Connection<DuplexStream>, DuplexStream, Places, Clock) {
+        let clock = Clock::start();
+        let places = Arc::new(Mutex::new(Slots::new(2)));
+        let (near, far) = tokio::io::duplex(64);
+        let place = Place::take(&places, "127.0.0.1:1".parse().unwrap());
+        (Connection::new(near, place, clock), far, places, clock)
+    }
+
+    /// Writes a byte every so often until nobody reads any more.
+    async fn dribble(mut far: DuplexStream, pause: Duration) {
+        while far.write_all(b"x").await.is_ok() {
+            tokio::time::sleep(pause).await;
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_request_that_dribbles_in_is_ended_after_ten_seconds() {
+        let (mut connection, far, places, clock) = connection();
+        tokio::spawn(dribble(far, Duration::from_secs(1)));
+        let error = connection.read_to_end(&mut Vec::new()).await.unwrap_err();
+        assert_eq!(error.kind(), io::ErrorKind::TimedOut);
+        assert_eq!(clock.now().instant.as_millis() / 100, 100);
+        drop(connection);
+        assert_eq!(lock(&places).in_use(), 0);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn every_request_of_a_connection_has_its_own_time() {
+        let (mut connection, mut far, _places, clock) = connection();
+        let mut bytes = [0; 8];
+        for _ in 0..5 {
+            tokio::time::sleep(Duration::from_secs(8)).await;
+            far.write_all(b"request").await.unwrap();
+            assert_eq!(connection.read(&mut bytes).await.unwrap(), 7);
+            connection.write_all(b"answer").await.unwrap();
+            assert_eq!(far.read(&mut bytes).await.unwrap(), 6);
+        }
+        let before = clock.now().instant;
+        assert!(connection.read(&mut bytes).await.is_err(), "and none may stay for ever without one");
+        assert_eq!(clock.now().instant.since(before).as_secs(), IDLE_TIMEOUT.as_secs());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn who_must_make_room_ends_at_once() {
+        let (mut connection, _far, places, clock) = connection();
+        let _others = [2, 3].map(|port| Place::take(&places, SocketAddr::from(([127, 0, 0, 1], port))));
+        assert!(connection.read(&mut [0]).await.is_err());
+        assert_eq!(clock.now().instant.as_millis(), 0);
+        assert_eq!(lock(&places).in_use(), 2);
     }
 }

@@ -1,5 +1,6 @@
 //! `/metrics` in the Prometheus text format, pure: a snapshot of the process image as families of numbers.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 
@@ -22,7 +23,7 @@ pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; cha
 /// All numbers of one moment.
 #[derive(Debug, Default)]
 pub struct Metrics {
-    families: BTreeMap<&'static str, Family>,
+    families: BTreeMap<Cow<'static, str>, Family>,
 }
 
 #[derive(Debug)]
@@ -48,7 +49,8 @@ impl Metrics {
         metrics.nodes(table, image, now);
         metrics.alarms(table, image);
         for reading in health.readings {
-            metrics.add(reading);
+            let Reading { name, help, kind, labels, value } = reading;
+            metrics.add(name.into(), (help, kind), labels, value);
         }
         metrics
     }
@@ -66,46 +68,36 @@ impl Metrics {
         }
     }
 
-    fn add(&mut self, reading: Reading) {
-        let family = self.families.entry(reading.name).or_insert_with(|| Family {
-            help: reading.help,
-            kind: reading.kind,
-            numbers: Vec::new(),
-        });
-        family.numbers.push((reading.labels, reading.value));
+    fn add(
+        &mut self,
+        name: Cow<'static, str>,
+        (help, kind): (&'static str, ReadingKind),
+        labels: Vec<(&'static str, String)>,
+        value: f64,
+    ) {
+        let new = || Family { help, kind, numbers: Vec::new() };
+        self.families.entry(name).or_insert_with(new).numbers.push((labels, value));
     }
 
     fn gauge(
         &mut self,
-        name: &'static str,
+        name: impl Into<Cow<'static, str>>,
         help: &'static str,
         labels: &[(&'static str, &str)],
         value: impl Into<f64>,
     ) {
-        self.number(ReadingKind::Gauge, name, help, labels, value.into());
+        self.add(name.into(), (help, ReadingKind::Gauge), owned(labels), value.into());
     }
 
     #[expect(clippy::as_conversions, clippy::cast_precision_loss, reason = "Prometheus counts in doubles")]
     fn counter(
         &mut self,
-        name: &'static str,
+        name: impl Into<Cow<'static, str>>,
         help: &'static str,
         labels: &[(&'static str, &str)],
         value: u64,
     ) {
-        self.number(ReadingKind::Counter, name, help, labels, value as f64);
-    }
-
-    fn number(
-        &mut self,
-        kind: ReadingKind,
-        name: &'static str,
-        help: &'static str,
-        labels: &[(&'static str, &str)],
-        value: f64,
-    ) {
-        let labels = labels.iter().map(|(name, text)| (*name, (*text).to_owned())).collect();
-        self.add(Reading { name, help, kind, labels, value });
+        self.add(name.into(), (help, ReadingKind::Counter), owned(labels), value as f64);
     }
 
     fn program(
@@ -142,15 +134,8 @@ impl Metrics {
                 let ratio = f64::from(permille) / 1000.0;
                 self.gauge("bus_load_ratio", "Load of the bus over the last second", labels, ratio);
             }
-            for (name, help, count) in [
-                ("bus_frames_received", "Frames received", bus.frames_received),
-                ("bus_frames_sent", "Frames sent", bus.frames_sent),
-                ("bus_frames_not_sent", "Frames that could not be sent", bus.frames_not_sent),
-                ("bus_errors", "Error frames", bus.errors),
-                ("bus_off", "Times that the controller went bus-off", bus.bus_off_count),
-                ("bus_overruns", "Frames that the kernel dropped", bus.overruns),
-                ("bus_foreign_frames", "Frames that belong to no configured node", bus.foreign_frames),
-            ] {
+            for (name, help, count) in bus.named() {
+                let name = if name == "bus_off_count" { "bus_off".into() } else { format!("bus_{name}") };
                 self.counter(name, help, labels, count);
             }
         }
@@ -182,20 +167,9 @@ impl Metrics {
     }
 
     fn node_counters(&mut self, labels: &[(&'static str, &str)], status: &NodeStatus) {
-        let counters = &status.counters;
-        for (name, help, count) in [
-            ("node_frames_received", "Frames received from the node", counters.frames_received),
-            ("node_restarts", "Boot-up messages after the first contact", counters.restarts),
-            ("node_guard_misses", "Guard requests without a reply in time", counters.guard_misses),
-            ("node_toggle_errors", "Guard replies with the wrong toggle bit", counters.toggle_errors),
-            ("node_pdo_length_errors", "TPDOs too short or too long", counters.pdo_length_errors),
-            ("node_nmt_commands_sent", "NMT commands sent to the node", counters.nmt_commands_sent),
-            ("node_emcys", "Emergency messages", counters.emcys),
-            ("node_sdo_errors", "SDO transfers that failed", counters.sdo_errors),
-            ("node_unexpected_states", "States that were not ordered", counters.unexpected_states),
-            ("node_malformed_frames", "Frames that cannot be right", counters.malformed),
-            ("node_reserved_bits", "Frames with a reserved bit set", counters.reserved_bits),
-        ] {
+        for (name, help, count) in status.counters.named() {
+            let name =
+                if name == "malformed" { "node_malformed_frames".into() } else { format!("node_{name}") };
             self.counter(name, help, labels, count);
         }
     }
@@ -214,6 +188,10 @@ impl Metrics {
             self.counter("alarm_raised", "Times that the alarm was raised", labels, status.count);
         }
     }
+}
+
+fn owned(labels: &[(&'static str, &str)]) -> Vec<(&'static str, String)> {
+    labels.iter().map(|(name, text)| (*name, (*text).to_owned())).collect()
 }
 
 impl Collector for Metrics {

@@ -5,17 +5,23 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
-use axum::extract::{Path, Query, State, rejection::QueryRejection};
+use axum::body::Bytes;
+use axum::extract::rejection::{PathRejection, QueryRejection};
+use axum::extract::{Path, Query, Request, State};
 use axum::http::{HeaderName, HeaderValue, StatusCode, header};
+use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use serde::{Deserialize, Serialize};
 use tokio::net::TcpListener;
+use tokio::sync::Mutex;
 use tokio_util::sync::CancellationToken;
 
 use super::health::HealthSource;
+use super::host::Hosts;
 use super::listener::LimitedListener;
 use super::metrics::{self, Metrics};
+use super::recent::Recent;
 use super::settings::WebSettings;
 use super::status::{About, Alarms, Events, NodeView, Status};
 use crate::mapping::TagTable;
@@ -76,6 +82,7 @@ pub struct Server {
     listener: TcpListener,
     address: SocketAddr,
     router: Router,
+    clock: Clock,
 }
 
 impl Server {
@@ -87,7 +94,8 @@ impl Server {
         let failed = |source| WebError { address: settings.listen, source };
         let listener = TcpListener::bind(settings.listen).await.map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
-        Ok(Self { listener, address, router: router(state) })
+        let (hosts, clock) = (Hosts::new(&state.table.gateway, &settings.allowed_hosts), state.clock);
+        Ok(Self { listener, address, router: router(state, hosts), clock })
     }
 
     /// Where it listens.
@@ -99,7 +107,7 @@ impl Server {
     /// Answers until `stop`, then lets open requests end for a second.
     pub async fn run(self, stop: CancellationToken) {
         let stopped = stop.clone().cancelled_owned();
-        let serving = axum::serve(LimitedListener::new(self.listener), self.router)
+        let serving = axum::serve(LimitedListener::new(self.listener, self.clock), self.router)
             .with_graceful_shutdown(stopped)
             .into_future();
         let patience = async {
@@ -114,7 +122,8 @@ impl Server {
     }
 }
 
-fn router(state: WebState) -> Router {
+fn router(state: WebState, hosts: Hosts) -> Router {
+    let hosts = Arc::new(hosts);
     Router::new()
         .route("/", get(page))
         .route("/livez", get(|| async { json(StatusCode::OK, &Live { alive: true }) }))
@@ -133,11 +142,27 @@ fn router(state: WebState) -> Router {
         .method_not_allowed_fallback(|| async {
             error(StatusCode::METHOD_NOT_ALLOWED, "everything here is read with GET; nothing can be changed")
         })
+        .layer(axum::middleware::from_fn_with_state(hosts, only_for_us))
         .layer(axum::middleware::map_response(with_headers))
-        .with_state(Arc::new(state))
+        .with_state(Arc::new(Site { state, recent: Answers::default() }))
 }
 
-type Shared = State<Arc<WebState>>;
+type Shared = State<Arc<Site>>;
+
+/// What the routes share.
+struct Site {
+    state: WebState,
+    recent: Answers,
+}
+
+/// The last answers of the routes that copy the whole image. Behind a lock each, so that of many who ask at once one
+/// makes the answer and the others wait for it.
+#[derive(Default)]
+struct Answers {
+    status: Mutex<Recent<Bytes>>,
+    alarms: Mutex<Recent<Bytes>>,
+    metrics: Mutex<Recent<Bytes>>,
+}
 
 #[derive(Serialize)]
 struct Live {
@@ -175,35 +200,57 @@ async fn page() -> Response {
     response
 }
 
-async fn ready(State(state): Shared) -> Response {
-    let reasons = (state.health)().not_ready;
+/// Refuses what was meant for somebody else; browsers always say for whom.
+async fn only_for_us(State(hosts): State<Arc<Hosts>>, request: Request, next: Next) -> Response {
+    let host = request.headers().get(header::HOST);
+    if host.is_none_or(|host| host.to_str().is_ok_and(|host| hosts.names_us(host))) {
+        return next.run(request).await;
+    }
+    error(
+        StatusCode::MISDIRECTED_REQUEST,
+        "this gateway does not know that name as its own: use its address, or add the name to `allowed_hosts` in [http]",
+    )
+}
+
+async fn ready(State(site): Shared) -> Response {
+    let reasons = (site.state.health)().not_ready;
     let code = if reasons.is_empty() { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     json(code, &Ready { ready: reasons.is_empty(), reasons })
 }
 
-async fn metrics_text(State(state): Shared) -> Response {
-    let (health, now) = ((state.health)(), state.clock.now());
-    let metrics = state.reader.read(|image| Metrics::new(&state.table, &state.about, image, health, now));
-    text(metrics::CONTENT_TYPE, metrics.encode())
+async fn metrics_text(State(site): Shared) -> Response {
+    let WebState { table, reader, about, clock, health, .. } = &site.state;
+    let now = clock.now();
+    let made = site.recent.metrics.lock().await.get(now.instant, || {
+        let health = health();
+        reader.read(|image| Metrics::new(table, about, image, health, now)).encode().into()
+    });
+    text(metrics::CONTENT_TYPE, made)
 }
 
-async fn map_json(State(state): Shared) -> Response {
-    text("application/json", state.map_json.to_string())
+async fn map_json(State(site): Shared) -> Response {
+    text("application/json", site.state.map_json.to_string())
 }
 
-async fn map_csv(State(state): Shared) -> Response {
-    text("text/csv; charset=utf-8", state.map_csv.to_string())
+async fn map_csv(State(site): Shared) -> Response {
+    text("text/csv; charset=utf-8", site.state.map_csv.to_string())
 }
 
-async fn status(State(state): Shared) -> Response {
-    let (health, now) = ((state.health)(), state.clock.now());
-    let status = state.reader.read(|image| Status::new(&state.table, &state.about, image, health, now));
-    json(StatusCode::OK, &status)
+async fn status(State(site): Shared) -> Response {
+    let WebState { table, reader, about, clock, health, .. } = &site.state;
+    let now = clock.now();
+    let made = site.recent.status.lock().await.get(now.instant, || {
+        let health = health();
+        bytes(&reader.read(|image| Status::new(table, about, image, health, now)))
+    });
+    text("application/json", made)
 }
 
-async fn node(State(state): Shared, Path(name): Path<String>) -> Response {
+async fn node(State(site): Shared, name: Result<Path<String>, PathRejection>) -> Response {
+    let state = &site.state;
     let now = state.clock.now().instant;
-    let index = state.table.find_node(&name);
+    // What is no text is no name either.
+    let index = name.ok().and_then(|Path(name)| state.table.find_node(&name));
     let view =
         index.and_then(|node| state.reader.read(|image| NodeView::new(&state.table, image, node, now)));
     match view {
@@ -212,35 +259,42 @@ async fn node(State(state): Shared, Path(name): Path<String>) -> Response {
     }
 }
 
-async fn alarms(State(state): Shared) -> Response {
-    json(StatusCode::OK, &state.reader.read(|image| Alarms::new(&state.table, image)))
+async fn alarms(State(site): Shared) -> Response {
+    let WebState { table, reader, clock, .. } = &site.state;
+    let made = site
+        .recent
+        .alarms
+        .lock()
+        .await
+        .get(clock.now().instant, || bytes(&reader.read(|image| Alarms::new(table, image))));
+    text("application/json", made)
 }
 
-async fn events(State(state): Shared, query: Result<Query<EventsQuery>, QueryRejection>) -> Response {
+async fn events(State(site): Shared, query: Result<Query<EventsQuery>, QueryRejection>) -> Response {
     let Ok(Query(EventsQuery { after })) = query else {
         return error(StatusCode::BAD_REQUEST, "`after` is the sequence number of the last event you have");
     };
-    json(StatusCode::OK, &state.reader.read(|image| Events::after(&state.table, image, after)))
+    let WebState { table, reader, .. } = &site.state;
+    json(StatusCode::OK, &reader.read(|image| Events::after(table, image, after)))
 }
 
 fn json(code: StatusCode, body: &impl Serialize) -> Response {
-    let Ok(body) = serde_json::to_string(body) else { return broken() };
-    let mut response = text("application/json", body);
+    let mut response = text("application/json", bytes(body));
     *response.status_mut() = code;
     response
+}
+
+/// Our own structs are always JSON; were one not, the answer would be empty and the server would go on.
+fn bytes(body: &impl Serialize) -> Bytes {
+    serde_json::to_vec(body).unwrap_or_default().into()
 }
 
 fn error(code: StatusCode, error: &str) -> Response {
     json(code, &Problem { error })
 }
 
-fn text(kind: &'static str, body: String) -> Response {
-    ([(header::CONTENT_TYPE, HeaderValue::from_static(kind))], body).into_response()
-}
-
-/// Our own structs are always JSON; were one not, the server goes on.
-fn broken() -> Response {
-    StatusCode::INTERNAL_SERVER_ERROR.into_response()
+fn text(kind: &'static str, body: impl Into<Bytes>) -> Response {
+    ([(header::CONTENT_TYPE, HeaderValue::from_static(kind))], body.into()).into_response()
 }
 
 /// What every answer carries: values are of now, and are nothing but what their type says.

@@ -12,11 +12,16 @@ pub struct WebSettings {
     /// Address and port. Anyone who reaches it can read every value; nothing can be changed through it.
     #[schemars(with = "String")]
     pub listen: SocketAddr,
+    /// Names with a dot under which this gateway is called in a browser's address, beside its addresses, `localhost` and its
+    /// own name. Requests for other names are refused, so that a web page from elsewhere cannot read values through the
+    /// browser of somebody in the plant.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub allowed_hosts: Vec<String>,
 }
 
 impl Default for WebSettings {
     fn default() -> Self {
-        Self { listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080) }
+        Self { listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080), allowed_hosts: Vec::new() }
     }
 }
 

@@ -1,13 +1,13 @@
 //! The JSON of `/api/v1`, pure: copied out of the process image under its lock, written as text outside it.
 
 use serde::Serialize;
-use serde_json::Number;
 
 use super::health::{ProgramHealth, SessionHealth};
-use crate::mapping::{AlarmDef, AlarmOwner, Derived, FieldKind, NodeDef, Source, TagTable};
+use crate::mapping::{AlarmDef, AlarmOwner, Derived, FieldKind, NodeDef, Objection, Source, TagTable};
+use crate::process_image::value::rounded;
 use crate::process_image::{
-    AlarmState, AlarmStatus, Event, NmtState, NodeIndex, NodeStatus, Priority, ProcessImage, Quality, Reason,
-    Sample, TagIndex, Value,
+    AlarmState, AlarmStatus, Event, NmtState, NodeIndex, NodeStatus, Priority, ProcessImage, Quality,
+    TagIndex, Value,
 };
 use crate::time::{Instant, Now, Timestamp};
 
@@ -92,13 +92,8 @@ pub struct BusView<'a> {
     state: &'static str,
     load_percent: Option<f64>,
     frames_per_second: u32,
-    frames_received: u64,
-    frames_sent: u64,
-    frames_not_sent: u64,
-    errors: u64,
-    bus_off_count: u64,
-    overruns: u64,
-    foreign_frames: u64,
+    #[serde(flatten)]
+    counters: Counters<7>,
 }
 
 impl<'a> BusView<'a> {
@@ -108,13 +103,7 @@ impl<'a> BusView<'a> {
             state: bus.state.word(),
             load_percent: bus.load_permille.map(|permille| f64::from(permille) / 10.0),
             frames_per_second: bus.frames_per_second,
-            frames_received: bus.frames_received,
-            frames_sent: bus.frames_sent,
-            frames_not_sent: bus.frames_not_sent,
-            errors: bus.errors,
-            bus_off_count: bus.bus_off_count,
-            overruns: bus.overruns,
-            foreign_frames: bus.foreign_frames,
+            counters: Counters(bus.named()),
         };
         table.buses.iter().zip(&image.buses).map(view).collect()
     }
@@ -141,7 +130,7 @@ pub struct NodeView<'a> {
     quality: &'static str,
     ts: Option<i64>,
     pdos: Vec<PdoView>,
-    counters: CountersView,
+    counters: Counters<11>,
     tags: Vec<TagView<'a>>,
 }
 
@@ -153,19 +142,14 @@ struct PdoView {
     received: u64,
 }
 
-#[derive(Debug, Serialize)]
-struct CountersView {
-    frames_received: u64,
-    restarts: u64,
-    guard_misses: u64,
-    toggle_errors: u64,
-    pdo_length_errors: u64,
-    nmt_commands_sent: u64,
-    emcys: u64,
-    sdo_errors: u64,
-    unexpected_states: u64,
-    malformed: u64,
-    reserved_bits: u64,
+/// Counters by their names, in the order in which they are told.
+#[derive(Debug)]
+struct Counters<const N: usize>([(&'static str, &'static str, u64); N]);
+
+impl<const N: usize> Serialize for Counters<N> {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_map(self.0.iter().map(|(name, _, count)| (name, count)))
+    }
 }
 
 impl<'a> NodeView<'a> {
@@ -192,7 +176,7 @@ impl<'a> NodeView<'a> {
             quality: quality.word(),
             ts: status.newest_data.map(Timestamp::as_millis),
             pdos: pdos(status, now),
-            counters: counters(status),
+            counters: Counters(status.counters.named()),
             tags: tags(table, image, def, now),
         })
     }
@@ -208,23 +192,6 @@ fn pdos(status: &NodeStatus, now: Instant) -> Vec<PdoView> {
     views.collect()
 }
 
-fn counters(status: &NodeStatus) -> CountersView {
-    let counters = &status.counters;
-    CountersView {
-        frames_received: counters.frames_received,
-        restarts: counters.restarts,
-        guard_misses: counters.guard_misses,
-        toggle_errors: counters.toggle_errors,
-        pdo_length_errors: counters.pdo_length_errors,
-        nmt_commands_sent: counters.nmt_commands_sent,
-        emcys: counters.emcys,
-        sdo_errors: counters.sdo_errors,
-        unexpected_states: counters.unexpected_states,
-        malformed: counters.malformed,
-        reserved_bits: counters.reserved_bits,
-    }
-}
-
 fn tags<'a>(table: &'a TagTable, image: &ProcessImage, def: &NodeDef, now: Instant) -> Vec<TagView<'a>> {
     let tags = def.tags.clone().map(TagIndex).filter_map(|index| Some((index, table.tag(index)?)));
     let view = |(index, tag): (TagIndex, &'a crate::mapping::TagDef)| {
@@ -233,27 +200,16 @@ fn tags<'a>(table: &'a TagTable, image: &ProcessImage, def: &NodeDef, now: Insta
             name: &tag.name,
             description: &tag.description,
             kind: kind(&tag.source),
-            value: shown(sample, def.zero_on_bad).map(|value| Json::new(value, tag.decimals)),
+            value: sample.shown(def.zero_on_bad).map(|value| Json(value, tag.decimals)),
             unit: &tag.unit,
             decimals: tag.decimals,
             quality: sample.quality.word(),
-            reason: sample.quality.reason().map(Reason::word),
-            valid: tag.valid.is_none_or(|valid| image.tag(valid).value.is_true()),
+            reason: tag.objection(image, sample).map(Objection::word),
+            valid: tag.disowned(image).is_none(),
             age_ms: age_ms(sample.received_at, now),
         }
     };
     tags.map(view).collect()
-}
-
-/// The value to show: nothing where nothing was ever received; the last one otherwise, or 0 where the installation
-/// asks for it (R-DET-084).
-fn shown(sample: &Sample, zero_on_bad: bool) -> Option<Value> {
-    match (sample.quality.is_usable(), zero_on_bad, sample.value) {
-        (true, _, value) => Some(value),
-        (false, true, Value::Bool(_)) => Some(Value::Bool(false)),
-        (false, true, _) => Some(Value::Unsigned(0)),
-        (false, false, value) => sample.received_at.map(|_| value),
-    }
 }
 
 /// Whether a source gives bits or numbers.
@@ -279,32 +235,25 @@ pub struct TagView<'a> {
     unit: &'a str,
     decimals: u8,
     quality: &'static str,
+    /// Why it should not be used as it stands; the words are those of MQTT.
     reason: Option<&'static str>,
-    /// The device itself says that the value means something.
+    /// The device itself says that the value means something, and what it says is good.
     valid: bool,
     age_ms: Option<u64>,
 }
 
-/// A value as JSON: a bit, or a number rounded to its decimals; `null` for what is no number.
-#[derive(Debug, Serialize)]
-#[serde(untagged)]
-enum Json {
-    Bit(bool),
-    Number(Option<Number>),
-}
+/// A value and its decimals, as JSON: a bit, or a number that is rounded when it is written; `null` for what is no number.
+#[derive(Debug)]
+struct Json(Value, u8);
 
-impl Json {
-    fn new(value: Value, decimals: u8) -> Self {
-        match value {
-            Value::Bool(bit) => Self::Bit(bit),
-            Value::Unsigned(whole) => Self::Number(Some(whole.into())),
-            Value::Signed(whole) => Self::Number(Some(whole.into())),
-            Value::Float(number) => {
-                let factor = 10f64.powi(i32::from(decimals));
-                let rounded = (number * factor).round() / factor;
-                // A number so large that the factor overflows has no digits to round.
-                Self::Number(Number::from_f64(if rounded.is_finite() { rounded } else { number }))
-            }
+impl Serialize for Json {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self.0 {
+            Value::Bool(bit) => serializer.serialize_bool(bit),
+            Value::Unsigned(whole) => serializer.serialize_u64(whole),
+            Value::Signed(whole) => serializer.serialize_i64(whole),
+            // What is not finite is written as `null`.
+            Value::Float(number) => serializer.serialize_f64(rounded(number, self.1)),
         }
     }
 }
@@ -351,7 +300,7 @@ impl<'a> AlarmView<'a> {
             since: status.since.map(Timestamp::as_millis),
             count: status.count,
             first_out: status.first_out,
-            value: status.value.map(|value| Json::new(value, decimals(table, def))),
+            value: status.value.map(|value| Json(value, table.decimals(def.value))),
             text: &def.text,
             action: &def.action,
         }
@@ -402,7 +351,7 @@ impl EventView {
             from: event.from.clone(),
             to: event.to.clone(),
             priority: event.priority.map(Priority::word),
-            value: event.value.map(|value| Json::new(value, alarm.map_or(3, |alarm| decimals(table, alarm)))),
+            value: event.value.map(|value| Json(value, table.decimals(alarm.and_then(|alarm| alarm.value)))),
             text: event.text.clone(),
         }
     }
@@ -425,15 +374,10 @@ impl Events {
     /// The events after a sequence number.
     #[must_use]
     pub fn after(table: &TagTable, image: &ProcessImage, after: u64) -> Self {
-        let (events, missed) = image.journal.after(after);
-        let list = events.iter().map(|event| EventView::new(table, event)).collect();
+        let (events, missed) = image.journal.since(after);
+        let list = events.map(|event| EventView::new(table, event)).collect();
         Self { v: 1, newest: image.journal.newest(), missed, list }
     }
-}
-
-/// Digits after the decimal point of an alarm's value.
-fn decimals(table: &TagTable, alarm: &AlarmDef) -> u8 {
-    alarm.value.and_then(|tag| table.tag(tag)).map_or(3, |tag| tag.decimals)
 }
 
 fn age_ms(received: Option<Instant>, now: Instant) -> Option<u64> {
