@@ -12,7 +12,7 @@ use crate::mapping::{
     At, Diagnostic, Installation, SourceText, TagTable, build, is_name, locate, reader, shipped,
     sort_problems,
 };
-use crate::mqtt::settings::RESERVED_NODE_NAMES;
+use crate::mqtt::settings::{MqttSettings, RESERVED_NODE_NAMES};
 
 /// Version of the configuration that this program reads.
 const VERSION: u64 = 1;
@@ -95,6 +95,9 @@ fn check(source: &SourceText, settings: &Settings, overlay: &Overlay) -> Vec<Dia
     for problem in settings.modbus.problems() {
         let hint = format!("use {} to {}", problem.lowest, problem.highest);
         tell("modbus", problem.key, problem.to_string(), hint);
+    }
+    for (key, message, hint) in settings.mqtt.iter().flat_map(MqttSettings::problems) {
+        tell("mqtt", key, message.to_string(), hint.to_string());
     }
     for name in settings.node.keys().filter(|name| RESERVED_NODE_NAMES.contains(&name.value.as_str())) {
         let message = format!("`{}` cannot be the name of a node", name.value);
@@ -268,6 +271,20 @@ mapping = "motortech-detcon"
         assert!(problems[1].starts_with(
             "environment variable CANGATE__MODBUS__MAX_CONNECTIONS: error: `max_connections` is 0"
         ));
+    }
+
+    #[test]
+    fn a_password_without_a_user_name_is_refused() {
+        let text =
+            |extra: &str| format!("{TWO_ENGINES}[mqtt]\npassword_file = \"/run/secrets/mqtt\"\n{extra}");
+        let problems = read(&text(""), &[]).unwrap_err();
+        assert_eq!(problems.len(), 1, "{problems:#?}");
+        assert!(
+            problems[0].starts_with("etc/cangate.toml:16:17: error: a password without a `username`"),
+            "{problems:#?}"
+        );
+        assert!(problems[0].contains("add `username`"), "{problems:#?}");
+        assert!(read(&text("username = \"gateway\"\n"), &[]).is_ok());
     }
 
     #[test]
