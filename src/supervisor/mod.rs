@@ -7,8 +7,10 @@
 //! - `tasks` \[IO\]: the named tasks; a task that ends by itself is a bug and stops the process in order.
 //! - `shutdown` \[IO\]: signals.
 //! - [`readings`]: counters of the views for page and metrics.
+//! - `descriptors` \[IO\]: the limit of open files.
 //! - `health` \[IO\]: what the gateway is told about the rest of the program.
 
+pub mod descriptors;
 pub mod health;
 pub mod readings;
 pub mod shutdown;

@@ -9,7 +9,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::info;
 
 use super::tasks::{Ended, Tasks};
-use super::{health, readings};
+use super::{descriptors, health, readings};
 use crate::can::interface::Interface;
 use crate::can::{self, BusIndex};
 use crate::canopen::Role;
@@ -90,6 +90,7 @@ fn identity(map: &RegisterMap, clock: Clock) -> Identity {
 /// # Errors
 /// A listener's address cannot be used.
 pub async fn bind(installation: Installation, clock: Clock) -> Result<Bound, StartError> {
+    descriptors::raise_limit();
     let Installation { table, map, modbus, http, .. } = &installation;
     let mut gateway = Gateway::new(Arc::clone(table), clock.now());
     for (index, interface) in installation.interfaces.iter().enumerate() {
