@@ -378,7 +378,7 @@ mod tests {
     #[tokio::test]
     async fn a_report_that_is_never_read_stops_neither_the_devices_nor_the_end() {
         let (clock, stop) = (Clock::start(), CancellationToken::new());
-        let (mut heard, mut say) = virtual_bus::join("cli-sim-paused", clock).split();
+        let (mut heard, mut say) = virtual_bus::join("cli-sim-paused", clock);
         let options = SimOptions { interface: "virtual:cli-sim-paused".parse().unwrap(), ..options() };
         let sim = tokio::spawn(run(options, Cursor::new(""), Paused, clock, stop.clone()));
         let answered = async {
