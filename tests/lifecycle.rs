@@ -124,6 +124,7 @@ fn a_file_that_cannot_be_read_exits_with_74_and_is_named_whatever_the_command() 
         &["replay", missing, "-c", good],
         &["replay", missing, "-c", missing],
         &["sim", "detcon", "-i", "virtual:x", "--node", "1", "--scenario", missing],
+        &["health", "-c", missing],
     ] {
         let output = run(arguments);
         let said = String::from_utf8(output.stderr).unwrap();

@@ -193,7 +193,7 @@ pub struct HealthArguments {
     /// What to ask. Without it: /readyz at the address that the configuration says under [http].
     #[arg(value_name = "URL")]
     pub url: Option<Url>,
-    /// The configuration file; where there is none, the address is the default one.
-    #[arg(short, long, default_value = DEFAULT_FILE, value_name = "FILE", conflicts_with = "url")]
-    pub config: PathBuf,
+    /// The configuration file [default: /etc/cangate/cangate.toml, or 127.0.0.1:8080 where that does not exist].
+    #[arg(short, long, value_name = "FILE", conflicts_with = "url")]
+    pub config: Option<PathBuf>,
 }

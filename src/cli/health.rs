@@ -12,6 +12,7 @@ use std::time::Duration;
 use super::args::HealthArguments;
 use super::output::{print_error, print_line};
 use super::{Exit, load};
+use crate::config::DEFAULT_FILE;
 use crate::web::WebSettings;
 
 /// For the connection, and for each step of the answer.
@@ -69,7 +70,7 @@ impl Url {
 pub(super) fn run(arguments: &HealthArguments) -> Exit {
     let url = match &arguments.url {
         Some(url) => Ok(url.clone()),
-        None => configured(&arguments.config),
+        None => configured(arguments.config.as_deref()),
     };
     let url = match url {
         Ok(url) => url,
@@ -94,9 +95,13 @@ pub(super) fn run(arguments: &HealthArguments) -> Exit {
     }
 }
 
-/// Where the gateway of a configuration listens; where there is no file, as in a demo, the default.
-fn configured(file: &Path) -> Result<Url, Exit> {
-    let http = if file.exists() { load::configuration(file)?.settings.http } else { WebSettings::default() };
+/// Where the gateway of a configuration listens. Without the default file, as in a demo, at the default address.
+fn configured(file: Option<&Path>) -> Result<Url, Exit> {
+    let default = Path::new(DEFAULT_FILE);
+    let http = match file {
+        None if matches!(default.try_exists(), Ok(false)) => WebSettings::default(),
+        file => load::configuration(file.unwrap_or(default))?.settings.http,
+    };
     Ok(Url::ready(http.listen))
 }
 
