@@ -14,6 +14,7 @@
 //! | `web_server` | health, metrics, page |
 //! | `lifecycle` | the program as a process: start, stop, exit codes |
 //! | `properties` | random input: no panic, no torn value |
+//! | `documents` | the documents against the program: alarms, keys, commands, names of tests |
 //! | `requirements` | every requirement has a test whose name cites it, or a reason |
 //!
 //! Tests on a real CAN bus are in `tests/vcan`, those of the container in `tests/container`.
@@ -40,6 +41,7 @@ mod contract;
 mod contract_mqtt;
 mod conversations;
 mod devices;
+mod documents;
 mod lifecycle;
 mod mappings;
 mod modbus_server;

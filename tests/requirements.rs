@@ -6,7 +6,7 @@ use std::fs;
 use std::path::Path;
 
 /// Names of the test functions of a source text: those with a test attribute, and without one that leaves them out.
-fn tests_of(text: &str) -> BTreeSet<String> {
+pub fn tests_of(text: &str) -> BTreeSet<String> {
     let (mut is_test, mut is_left_out) = (false, false);
     let mut names = BTreeSet::new();
     for line in text.lines().map(str::trim_start).filter(|line| !line.starts_with("//")) {
