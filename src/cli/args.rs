@@ -190,7 +190,7 @@ pub struct ManArguments {
 /// `cangate health`
 #[derive(Args, Debug)]
 pub struct HealthArguments {
-    /// What to ask. Without it: /readyz at the address that the configuration says under [http].
+    /// What to ask. Without it: /readyz at the address that the configuration says under `[http]`.
     #[arg(value_name = "URL")]
     pub url: Option<Url>,
     /// The configuration file [default: /etc/cangate/cangate.toml, or 127.0.0.1:8080 where that does not exist].
