@@ -123,7 +123,7 @@ fn a_file_that_cannot_be_read_exits_with_74_and_is_named_whatever_the_command() 
         &["map", "diff", missing, missing],
         &["replay", missing, "-c", good],
         &["replay", missing, "-c", missing],
-        &["sim", "detcon", "-i", "virtual:x", "--node", "1", "--scenario", missing],
+        &["sim", "detcon", "-i", "cgtest-none", "--node", "1", "--scenario", missing],
         &["health", "-c", missing],
     ] {
         let output = run(arguments);
@@ -146,7 +146,7 @@ fn a_file_whose_content_is_wrong_exits_with_78_whatever_the_command() {
         &["map", "-c", wrong],
         &["map", "diff", wrong, wrong],
         &["replay", wrong, "-c", good],
-        &["sim", "detcon", "-i", "virtual:x", "--node", "1", "--scenario", wrong],
+        &["sim", "detcon", "-i", "cgtest-none", "--node", "1", "--scenario", wrong],
     ] {
         let output = run(arguments);
         let said = String::from_utf8(output.stderr).unwrap();
