@@ -11,10 +11,12 @@
 //! - [`slcan_port`] \[IO\]: LAWICEL adapters on serial ports and TCP, with [`slcan_session`] \[IO\] (the conversation)
 //!   and, pure, [`slcan`] (their language) and [`slcan_answers`] (what is known of one of them).
 //! - [`virtual_bus`] \[IO\]: buses inside the process.
-//! - [`task`] \[IO\]: owns one bus, opens it again whenever it was lost, counts; [`outage`] keeps its log short.
+//! - [`task`] \[IO\]: owns one bus, opens it again whenever it was lost, counts; [`bus_log`] tells the log of it, and
+//!   [`outage`] keeps that short.
 //! - [`recording`]: candump logs, pure.
 
 pub mod bus;
+pub mod bus_log;
 pub mod controller;
 pub mod frame;
 pub mod host_link;

@@ -13,8 +13,9 @@ use tokio::sync::mpsc;
 use tokio::time::{Interval, MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
+use super::bus_log::BusLog;
 use super::interface::Interface;
-use super::outage::{Outage, OutageMessage, Repeats};
+use super::outage::Repeats;
 use super::{BusCounters, BusError, BusEvent, BusIndex, BusReader, BusWriter, CanFrame, Link, Tally, open};
 use crate::time::{Clock, Instant};
 
@@ -209,7 +210,7 @@ async fn read_for_ever<R: BusReader, W: BusWriter>(
 ) -> Result<std::convert::Infallible, GatewayGone> {
     let mut reports = interval(REPORT_EVERY);
     reports.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut log = Log::default();
+    let mut log = BusLog::new(&desk.name);
     let mut wait = FIRST_WAIT;
     loop {
         let error = match open() {
@@ -227,7 +228,7 @@ async fn read_for_ever<R: BusReader, W: BusWriter>(
             }
             Err(error) => error,
         };
-        log.handle_error(&desk.name, &error, desk.clock.now().instant);
+        log.handle_error(&error, desk.clock.now().instant);
         if desk.set_link(Link::Absent) {
             desk.tell(BusEvent::Link { link: Link::Absent, at: desk.clock.now() }).await?;
         }
@@ -237,7 +238,7 @@ async fn read_for_ever<R: BusReader, W: BusWriter>(
             tokio::select! {
                 () = &mut again => break,
                 _ = reports.tick() => {
-                    log.handle_timeout(&desk.name, desk.clock.now().instant);
+                    log.handle_timeout(desk.clock.now().instant);
                     desk.tell_counters().await?;
                 }
             }
@@ -246,19 +247,10 @@ async fn read_for_ever<R: BusReader, W: BusWriter>(
     }
 }
 
-/// What the log has been told.
-#[derive(Default)]
-struct Log {
-    outage: Outage,
-    passive: Repeats,
-    suspected_bit_rate: bool,
-    told_of_acknowledging: bool,
-}
-
 /// From one opening of the bus to its failure.
 struct Session<'a> {
     desk: &'a Desk,
-    log: &'a mut Log,
+    log: &'a mut BusLog,
     /// Since when the bus has worked, of this opening.
     up_since: Option<Instant>,
 }
@@ -279,21 +271,15 @@ impl Session<'_> {
                 }
             };
             let tally = reader.tally();
-            if self.desk.listen_only && self.log.is_acknowledging_news(tally.listens_only) {
-                tracing::warn!(
-                    interface = self.desk.name,
-                    "the passive role sends no frame, but this interface acknowledges those of others, and disturbs the \
-                     bus at a wrong bit rate; where the controller can, `ip link set {0} down` and \
-                     `ip link set {0} up type can listen-only on`",
-                    self.desk.name
-                );
+            if self.desk.listen_only {
+                self.log.handle_listening(tally.listens_only);
             }
             let lost_frames = self.desk.take_tally(tally);
             if event.is_none() {
-                self.log.handle_timeout(&self.desk.name, self.desk.clock.now().instant);
+                self.log.handle_timeout(self.desk.clock.now().instant);
             }
             if lost_frames || event.is_none() {
-                self.suspect_bit_rate();
+                self.log.handle_counters(&self.desk.state().counters);
                 self.desk.tell_counters().await?;
             }
             if let Some(event) = event {
@@ -312,87 +298,14 @@ impl Session<'_> {
                 if link.is_up() {
                     self.up_since.get_or_insert(at.instant);
                 }
-                self.log.handle_link(&self.desk.name, link, at.instant);
-                self.suspect_bit_rate();
+                self.log.handle_link(link, at.instant);
+                self.log.handle_counters(&self.desk.state().counters);
             }
             BusEvent::NotSent { frame, .. } => self.desk.count_came_back(&frame),
             // Counters are this task's own business.
             BusEvent::Counters { .. } => return Ok(()),
         }
         self.desk.tell(event).await
-    }
-
-    fn suspect_bit_rate(&mut self) {
-        let counters = self.desk.state().counters;
-        if self.log.suspected_bit_rate || !counters.bit_rate_is_suspect() {
-            return;
-        }
-        self.log.suspected_bit_rate = true;
-        let bit_rate = counters.bit_rate.map_or_else(|| "unknown".to_owned(), |rate| format!("{rate} bit/s"));
-        tracing::warn!(
-            interface = self.desk.name,
-            bit_rate,
-            error_frames = counters.error_frames,
-            "errors and not one valid frame: the bit rate may differ from that of the bus; else look at the \
-             wiring and the terminators"
-        );
-    }
-}
-
-impl Log {
-    fn handle_link(&mut self, interface: &str, link: Link, at: Instant) {
-        let message = match trouble(interface, link) {
-            Some(reason) => self.outage.handle_down(&reason, at),
-            None => self.outage.handle_up(at),
-        };
-        write(interface, message);
-        if link == Link::ErrorActive {
-            tracing::debug!(interface, "error active");
-        }
-        if link == Link::ErrorPassive
-            && let Some(unsaid) = self.passive.admit(at)
-        {
-            let text = "error passive: nobody acknowledges, or wiring or bit rate are wrong";
-            tracing::warn!(interface, unsaid, "{text}");
-        }
-    }
-
-    fn handle_error(&mut self, interface: &str, error: &BusError, now: Instant) {
-        let reason = format!("{error}; trying again until it works");
-        write(interface, self.outage.handle_down(&reason, now));
-    }
-
-    /// Whether to tell that an interface that should only listen acknowledges frames. Once is enough.
-    fn is_acknowledging_news(&mut self, listens_only: Option<bool>) -> bool {
-        listens_only == Some(false) && !std::mem::replace(&mut self.told_of_acknowledging, true)
-    }
-
-    fn handle_timeout(&mut self, interface: &str, now: Instant) {
-        write(interface, self.outage.handle_timeout(now));
-    }
-}
-
-/// Why a bus in this state cannot be used, if so.
-fn trouble(interface: &str, link: Link) -> Option<String> {
-    match link {
-        Link::ErrorActive | Link::ErrorPassive => None,
-        Link::BusOff => Some(format!(
-            "bus-off: the controller has left the bus; it comes back by itself where the interface has a restart-ms, \
-             else with `ip link set {interface} type can restart`"
-        )),
-        Link::Down | Link::Absent => {
-            Some(format!("the interface is down; bring it up with `ip link set {interface} up`"))
-        }
-    }
-}
-
-fn write(interface: &str, message: Option<OutageMessage>) {
-    match message {
-        Some(OutageMessage::Begun { reason, unsaid }) => tracing::warn!(interface, unsaid, "{reason}"),
-        Some(OutageMessage::Over { lasted }) => {
-            tracing::info!(interface, seconds = lasted.as_secs(), "the bus works again");
-        }
-        None => {}
     }
 }
 
@@ -404,7 +317,7 @@ async fn write_for_ever<W: BusWriter>(
 ) -> Result<(), GatewayGone> {
     let mut failures = Repeats::default();
     while let Some(frame) = transmit.recv().await {
-        // The lock ends here: the gateway may be slow to take what it is told.
+        // The lock ends with this statement: the gateway may be slow to take what it is told.
         let sent = match writer.lock().await.as_mut() {
             Some(writer) if desk.is_up() => Some(writer.send(&frame).await),
             Some(_) | None => None,

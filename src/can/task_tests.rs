@@ -327,18 +327,6 @@ async fn a_bus_that_has_worked_for_ten_seconds_is_opened_again_at_once() {
     assert_eq!(opened, [0, 10_100, 20_200, 30_300, 40_400, 50_500]);
 }
 
-#[test]
-fn a_bus_that_is_down_or_off_is_in_trouble_and_its_end_is_told() {
-    for link in [Link::Absent, Link::Down, Link::BusOff] {
-        let mut log = Log::default();
-        log.handle_link("can0", link, Instant::START);
-        assert!(log.outage.handle_up(Instant::START).is_some(), "{link:?}");
-    }
-    for link in [Link::ErrorActive, Link::ErrorPassive] {
-        assert_eq!(trouble("can0", link), None);
-    }
-}
-
 #[tokio::test(start_paused = true)]
 async fn reading_goes_on_while_a_send_hangs() {
     struct Hanging;
@@ -374,15 +362,6 @@ async fn reading_goes_on_while_a_send_hangs() {
     while frames < 100 {
         frames += u32::from(matches!(told.recv().await.unwrap().1, BusEvent::Frame { .. }));
     }
-}
-
-#[test]
-fn an_interface_that_acknowledges_in_the_passive_role_is_told_of_once() {
-    let mut log = Log::default();
-    assert!(!log.is_acknowledging_news(None), "no controller, or nothing is known");
-    assert!(!log.is_acknowledging_news(Some(true)));
-    assert!(log.is_acknowledging_news(Some(false)));
-    assert!(!log.is_acknowledging_news(Some(false)));
 }
 
 #[tokio::test(start_paused = true)]
