@@ -47,6 +47,12 @@ pub fn emcy(node: NodeId) -> CanId {
     CanId::Standard(0x080 + u16::from(node.get()))
 }
 
+/// Answers of the SDO server of a node.
+#[must_use]
+pub fn sdo_answer(node: NodeId) -> CanId {
+    CanId::Standard(0x580 + u16::from(node.get()))
+}
+
 /// Boot-up, heartbeat and node guarding of a node.
 #[must_use]
 pub fn error_control(node: NodeId) -> CanId {

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use super::boot::BootEvent;
+use super::sdo::{SdoError, TransferId};
 use super::{NmtRequest, NmtState, NodeId, PdoIndex};
 use crate::can::{CanFrame, CanId};
 
@@ -118,6 +120,15 @@ pub enum NodeEvent {
     StartHeldBack {
         /// How long.
         wait: Duration,
+    },
+    /// What its boot found, did, or failed at.
+    Boot(BootEvent),
+    /// A transfer that was asked for is over: the bytes that were read (none after a write), or why it failed.
+    Sdo {
+        /// As it was asked for.
+        id: TransferId,
+        /// What came of it.
+        result: Result<Vec<u8>, SdoError>,
     },
     /// The node is operational after a `StartFailed`.
     StartSucceeded,

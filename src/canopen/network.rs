@@ -3,8 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use super::node::Node;
+use super::node::{Node, SdoRefused};
 use super::outputs::Outputs;
+use super::sdo::{SdoRequest, TransferId};
 use super::{
     ErrorControl, ForeignEvent, NetworkOutput, NetworkSettings, NmtRequest, NodeId, PdoIndex, Role, cob_id,
 };
@@ -42,6 +43,7 @@ enum Slot {
     Unknown,
     ErrorControl(usize),
     Emergency(usize),
+    SdoAnswer(usize),
     Pdo(usize, PdoIndex),
 }
 
@@ -49,7 +51,9 @@ impl Slot {
     fn node(self) -> Option<usize> {
         match self {
             Self::Unknown => None,
-            Self::ErrorControl(node) | Self::Emergency(node) | Self::Pdo(node, _) => Some(node),
+            Self::ErrorControl(node) | Self::Emergency(node) | Self::SdoAnswer(node) | Self::Pdo(node, _) => {
+                Some(node)
+            }
         }
     }
 }
@@ -102,6 +106,9 @@ impl Network {
             }
             network.claim(error_control, Slot::ErrorControl(place));
             network.claim(cob_id::emcy(node.id), Slot::Emergency(place));
+            if node.sdo.is_some() {
+                network.claim(cob_id::sdo_answer(node.id), Slot::SdoAnswer(place));
+            }
             let cob_ids = node.pdos.iter().map(|pdo| pdo.cob_id).enumerate();
             pdos.extend(cob_ids.map(|(index, id)| (id, Slot::Pdo(place, PdoIndex(index)))));
             let phase = step.saturating_mul(u32::try_from(place).unwrap_or(0));
@@ -129,6 +136,10 @@ impl Network {
                 node.handle_pdo(at, pdo, frame, outputs);
                 false
             }
+            (Slot::SdoAnswer(_), Some(node)) => {
+                node.handle_sdo_answer(at, frame, outputs);
+                false
+            }
             (Slot::Unknown, _) | (_, None) => {
                 self.handle_stranger(at, frame);
                 return;
@@ -140,7 +151,11 @@ impl Network {
             // It was on its way when the bus went down: it counts, but sets no clock going.
             node.pause();
         }
+        let moved = node.as_mut().map(|node| node.take_moved()).unwrap_or_default();
         self.next = earlier(self.next, node.and_then(|node| node.poll_timeout()));
+        if let Some(place) = slot.node() {
+            self.move_pdos(place, &moved);
+        }
         if let Some(place) = slot.node().filter(|_| start && self.link_up) {
             self.start(at, place);
         }
@@ -159,6 +174,8 @@ impl Network {
             for node in self.nodes.iter_mut().filter(|each| node == 0 || each.id.get() == node) {
                 node.command_not_sent(now.instant, request);
             }
+        } else {
+            self.nodes.iter_mut().for_each(|node| node.sdo_not_sent(frame));
         }
         self.look_ahead();
     }
@@ -196,13 +213,35 @@ impl Network {
         true
     }
 
+    /// Reads or writes an object of a node. If it is taken, [`NodeEvent::Sdo`](super::NodeEvent::Sdo) with this id will
+    /// follow, in bounded time. The highest bit of ids belongs to the boot of nodes.
+    pub fn request_sdo(
+        &mut self,
+        now: Now,
+        node: NodeId,
+        id: TransferId,
+        request: SdoRequest,
+    ) -> Result<(), SdoRefused> {
+        let place = self.nodes.iter().position(|each| each.id == node).ok_or(SdoRefused::NoSdo)?;
+        let node = self.nodes.get_mut(place).ok_or(SdoRefused::NoSdo)?;
+        node.request_sdo(now.instant, id, request, &mut self.outputs)?;
+        self.next = earlier(self.next, node.poll_timeout());
+        Ok(())
+    }
+
     /// What became due.
     pub fn handle_timeout(&mut self, now: Now) {
         let at = now.instant;
         for place in 0..self.nodes.len() {
             let Some(node) = self.nodes.get_mut(place) else { continue };
             let due = node.poll_timeout().is_some_and(|(deadline, _)| deadline <= at);
-            if due && node.handle_timeout(at, &mut self.outputs) {
+            if !due {
+                continue;
+            }
+            let start = node.handle_timeout(at, &mut self.outputs);
+            let moved = node.take_moved();
+            self.move_pdos(place, &moved);
+            if start {
                 self.start(at, place);
             }
         }
@@ -237,6 +276,21 @@ impl Network {
             self.outputs.transmit(NmtRequest::Start.frame(Some(node.id)));
             node.command_sent(now, NmtRequest::Start, false, &mut self.outputs);
             self.next = earlier(self.next, node.poll_timeout());
+        }
+    }
+
+    /// TPDOs of a node have other identifiers than before (R-DST-119). One that is somebody else's stays so.
+    fn move_pdos(&mut self, place: usize, moved: &[(PdoIndex, Option<CanId>)]) {
+        for (pdo, id) in moved {
+            let slot = Slot::Pdo(place, *pdo);
+            if id.is_some_and(|id| self.slot(id) == slot) {
+                continue;
+            }
+            self.standard.iter_mut().filter(|each| **each == slot).for_each(|each| *each = Slot::Unknown);
+            self.extended.retain(|_, each| *each != slot);
+            if let Some(id) = id {
+                self.claim(*id, slot);
+            }
         }
     }
 

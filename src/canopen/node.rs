@@ -4,14 +4,17 @@
 
 use std::time::Duration;
 
+use super::boot::BootSettings;
+use super::boot::{Boot, BootEvent, BootOutput};
 use super::duplicate::Duplicate;
 use super::guarding::{Failure, Guarding};
 use super::heartbeat::Heartbeat;
 use super::outputs::Outputs;
 use super::pdo::Pdos;
+use super::sdo::{Refused, SdoClient, SdoOutput, SdoRequest, TransferId};
 use super::start::Start;
-use super::{ErrorControl, NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, Role, cob_id};
-use crate::can::CanFrame;
+use super::{ErrorControl, NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex, Role, cob_id};
+use crate::can::{CanFrame, CanId};
 use crate::time::Instant;
 
 /// A boot-up message this long after an ordered reset was ordered too; slow devices take seconds.
@@ -24,6 +27,10 @@ pub(super) struct Node {
     pub(super) watch: Watch,
     /// `None` in the passive role.
     pub(super) start: Option<Start>,
+    pub(super) sdo: Option<SdoClient>,
+    pub(super) boot: Boot,
+    /// TPDOs of which the node has told another identifier.
+    moved: Vec<(PdoIndex, Option<CanId>)>,
     pub(super) pdos: Pdos,
     pub(super) duplicate: Duplicate,
     /// Started by nobody: its TPDOs may follow its boot-up message at once.
@@ -47,6 +54,20 @@ pub(super) struct Node {
     never_seen_after: Duration,
     never_seen_at: Option<Instant>,
     never_seen_told: bool,
+}
+
+/// Why an SDO transfer was not begun.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SdoRefused {
+    /// The bus is passive, or the node is not there or has no SDO.
+    #[error("no SDO is configured for this node, or the gateway is passive on its bus")]
+    NoSdo,
+    /// A stopped node answers no SDO (CiA 301, R-DST-071).
+    #[error("the node is stopped; in that state it answers no SDO")]
+    Stopped,
+    /// The client does not take it.
+    #[error(transparent)]
+    Client(#[from] Refused),
 }
 
 /// How the life of the node is watched.
@@ -103,11 +124,17 @@ impl Watch {
 impl Node {
     /// A node of which nothing is known; first guarded `phase` after `now`.
     pub(super) fn new(settings: NodeSettings, role: Role, phase: Duration, now: Instant) -> Self {
+        let master = role == Role::Master;
+        let sdo = settings.sdo.filter(|_| master).map(|sdo| SdoClient::new(settings.id, sdo));
+        let boot = Boot::new(if sdo.is_some() { settings.boot } else { BootSettings::default() });
         Self {
             id: settings.id,
             watch: Watch::new(settings.error_control, role, phase, now),
             self_starting: !settings.start.auto_start,
-            start: (role == Role::Master).then(|| Start::new(settings.start)),
+            start: master.then(|| Start::new(settings.start, boot.is_done())),
+            sdo,
+            boot,
+            moved: Vec::new(),
             duplicate: Duplicate::new(&settings.pdos),
             pdos: Pdos::new(settings.pdos),
             state: None,
@@ -245,6 +272,10 @@ impl Node {
         if let Some(start) = &mut self.start {
             start.pause();
         }
+        self.boot.pause();
+        if let Some(sdo) = &mut self.sdo {
+            sdo.pause();
+        }
         self.pdos.stop();
         self.never_seen_at = None;
         self.supervised = false;
@@ -260,6 +291,10 @@ impl Node {
         if let Some(start) = &mut self.start {
             start.resume(now);
         }
+        if let Some(sdo) = &mut self.sdo {
+            sdo.resume(now);
+        }
+        self.boot.resume(now);
         if self.state == Some(NmtState::Operational) && !self.watch.is_lost() {
             self.pdos.supervise(now);
         }
@@ -289,6 +324,11 @@ impl Node {
             }
             Watch::Nothing => {}
         }
+        if let Some(sdo) = &mut self.sdo {
+            sdo.handle_timeout(now);
+        }
+        self.boot.handle_timeout(now);
+        self.transfer(now, outputs);
         while let Some(pdo) = self.pdos.next_late(now) {
             outputs.node(self.id, NodeEvent::PdoTimeout { pdo });
         }
@@ -321,10 +361,105 @@ impl Node {
         let start = self.start.as_ref().and_then(Start::poll_timeout);
         let never_seen = self.never_seen_at.map(|at| (at, "node never seen"));
         let foreign_guard = self.foreign_guard_until.map(|at| (at, "another guarding master"));
-        [watch, start, self.pdos.poll_timeout(), self.duplicate.poll_timeout(), never_seen, foreign_guard]
-            .into_iter()
-            .flatten()
-            .min_by_key(|(at, _)| *at)
+        let sdo = self.sdo.as_ref().and_then(SdoClient::poll_timeout);
+        [
+            watch,
+            start,
+            sdo,
+            self.boot.poll_timeout(),
+            self.pdos.poll_timeout(),
+            self.duplicate.poll_timeout(),
+            never_seen,
+            foreign_guard,
+        ]
+        .into_iter()
+        .flatten()
+        .min_by_key(|(at, _)| *at)
+    }
+
+    /// Asks for a transfer.
+    pub(super) fn request_sdo(
+        &mut self,
+        now: Instant,
+        id: TransferId,
+        request: SdoRequest,
+        outputs: &mut Outputs,
+    ) -> Result<(), SdoRefused> {
+        if self.state == Some(NmtState::Stopped) {
+            return Err(SdoRefused::Stopped);
+        }
+        self.sdo.as_mut().ok_or(SdoRefused::NoSdo)?.request(now, id, request)?;
+        self.transfer(now, outputs);
+        Ok(())
+    }
+
+    /// An SDO request of ours did not leave.
+    pub(super) fn sdo_not_sent(&mut self, frame: &CanFrame) {
+        if let Some(sdo) = &mut self.sdo {
+            sdo.handle_not_sent(frame);
+        }
+    }
+
+    /// TPDOs that have another identifier than before; `None`: they are switched off.
+    pub(super) fn take_moved(&mut self) -> Vec<(PdoIndex, Option<CanId>)> {
+        std::mem::take(&mut self.moved)
+    }
+
+    /// Carries requests from the boot to the SDO client, and results back, until both have nothing more to say.
+    pub(super) fn transfer(&mut self, now: Instant, outputs: &mut Outputs) {
+        loop {
+            if let Some(output) = self.boot.poll_output() {
+                self.boot_output(now, output, outputs);
+            } else if let Some(output) = self.sdo.as_mut().and_then(SdoClient::poll_output) {
+                match output {
+                    SdoOutput::Transmit(frame) => outputs.transmit(frame),
+                    SdoOutput::Done(id, result) if Boot::is_mine(id) => self.boot.handle_sdo(now, id, result),
+                    SdoOutput::Done(id, result) => outputs.node(self.id, NodeEvent::Sdo { id, result }),
+                }
+            } else {
+                return;
+            }
+        }
+    }
+
+    fn boot_output(&mut self, now: Instant, output: BootOutput, outputs: &mut Outputs) {
+        match output {
+            BootOutput::Sdo(id, request) => {
+                // In Stopped a node takes no SDO requests (R-DST-071). Who stopped it wants it to stay so.
+                let stopped = self.state == Some(NmtState::Stopped);
+                let held = self.start.as_ref().is_some_and(Start::is_held);
+                if stopped && held {
+                    return self.boot.postpone(now);
+                }
+                if stopped {
+                    self.enter_pre_operational(now, outputs);
+                }
+                let taken = self.sdo.as_mut().is_some_and(|sdo| sdo.request(now, id, request).is_ok());
+                if !taken {
+                    self.boot.handle_refused(now);
+                }
+            }
+            BootOutput::EnterPreOperational => self.enter_pre_operational(now, outputs),
+            BootOutput::Tell(event) => {
+                if let BootEvent::Mapped(mapped) = &event {
+                    self.pdos.set_length(mapped.pdo, mapped.length());
+                    self.moved.push((mapped.pdo, mapped.cob_id));
+                }
+                let done = matches!(event, BootEvent::Done { .. });
+                outputs.node(self.id, NodeEvent::Boot(event));
+                if let Some(start) = self.start.as_mut().filter(|_| done) {
+                    start.handle_boot_done(now, self.state == Some(NmtState::Operational));
+                }
+            }
+        }
+    }
+
+    /// So that its configuration can be changed; it is started when that is done.
+    fn enter_pre_operational(&mut self, now: Instant, outputs: &mut Outputs) {
+        let request = NmtRequest::EnterPreOperational;
+        outputs.transmit(request.frame(Some(self.id)));
+        self.note_sent(now, request, outputs);
+        self.state = None;
     }
 
     /// A guard request was not answered.
@@ -346,8 +481,9 @@ impl Node {
     }
 
     /// A frame of this node came: the first ends the wait for it.
-    pub(super) fn frame_seen(&mut self, outputs: &mut Outputs) {
+    pub(super) fn frame_seen(&mut self, now: Instant, outputs: &mut Outputs) {
         outputs.node(self.id, NodeEvent::FrameSeen);
+        self.boot.handle_alive(now);
         if !self.seen {
             self.seen = true;
             self.never_seen_at = None;

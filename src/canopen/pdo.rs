@@ -36,6 +36,13 @@ impl Pdos {
         Self { pdos, supervised: false }
     }
 
+    /// The node sends another number of bytes than was thought.
+    pub(super) fn set_length(&mut self, index: PdoIndex, length: u8) {
+        if let Some(pdo) = self.pdos.get_mut(index.0) {
+            pdo.settings.length = length;
+        }
+    }
+
     /// A frame of this length came. A discarded one does not count as received. `None`: there is no such TPDO.
     pub(super) fn receive(&mut self, now: Instant, index: PdoIndex, dlc: u8) -> Option<Length> {
         let pdo = self.pdos.get_mut(index.0)?;

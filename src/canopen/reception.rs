@@ -27,7 +27,7 @@ impl Node {
             self.guard_request(now, outputs);
             return false;
         }
-        self.frame_seen(outputs);
+        self.frame_seen(now, outputs);
         if frame.dlc() != 1 {
             outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
         }
@@ -75,6 +75,12 @@ impl Node {
         if was_running && !expected {
             outputs.node(self.id, NodeEvent::Restarted);
         }
+        if !self.boot.is_empty() {
+            self.boot.handle_boot_up(now);
+            if let Some(start) = &mut self.start {
+                start.handle_boot_begun();
+            }
+        }
         self.invalid = None;
         self.set_state(NmtState::Initialising, true, outputs);
         self.ordered = None;
@@ -104,6 +110,8 @@ impl Node {
         };
         if recovered {
             outputs.node(self.id, NodeEvent::Recovered);
+            // It may be another device, or one that lost its settings: everything is read again.
+            self.boot.handle_recovered(now);
         }
         if !matches!(self.watch, Watch::Nothing) && !std::mem::replace(&mut self.supervised, true) {
             outputs.node(self.id, NodeEvent::Supervised);
@@ -184,6 +192,7 @@ impl Node {
 
     fn set_state(&mut self, to: NmtState, ordered: bool, outputs: &mut Outputs) {
         let from = self.state.replace(to);
+        self.boot.handle_state(to == NmtState::Operational);
         if from != Some(to) {
             if !ordered {
                 self.ordered = None;
@@ -213,7 +222,7 @@ impl Node {
             outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
             return;
         }
-        self.frame_seen(outputs);
+        self.frame_seen(now, outputs);
         let received = frame.dlc();
         let length = self.pdos.receive(now, pdo, received);
         let discarded = matches!(length, None | Some(Length::Discarded));
@@ -264,7 +273,7 @@ impl Node {
             outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
             return false;
         }
-        self.frame_seen(outputs);
+        self.frame_seen(now, outputs);
         match *frame.data() {
             [] => return self.boot_up(now, outputs),
             [low, high, register, ref rest @ ..] => {
@@ -278,6 +287,15 @@ impl Node {
             _ => outputs.node(self.id, NodeEvent::Malformed { frame: *frame }),
         }
         false
+    }
+
+    /// A frame on `0x580 + id`.
+    pub(super) fn handle_sdo_answer(&mut self, now: Instant, frame: &CanFrame, outputs: &mut Outputs) {
+        self.frame_seen(now, outputs);
+        if let Some(sdo) = &mut self.sdo {
+            sdo.handle_answer(now, frame);
+        }
+        self.transfer(now, outputs);
     }
 
     /// A 29-bit frame with the number of one of the node's identifiers (R-DET-006).

@@ -3,6 +3,8 @@
 use std::time::Duration;
 
 use super::NodeId;
+use super::boot::BootSettings;
+use super::sdo::SdoSettings;
 use crate::can::CanId;
 
 /// What the gateway may do on a bus.
@@ -36,6 +38,10 @@ pub struct NodeSettings {
     pub error_control: ErrorControl,
     /// How it is started.
     pub start: StartSettings,
+    /// How its objects are read and written; `None`: the node knows no SDO, and none is sent (R-DET-002).
+    pub sdo: Option<SdoSettings>,
+    /// What is done before it is started; nothing without SDO or in the passive role.
+    pub boot: BootSettings,
     /// The TPDOs that it sends, in the order of the mapping; [`PdoIndex`] counts in it.
     pub pdos: Vec<PdoSettings>,
     /// How long after the start of the gateway a node that showed no frame at all is reported (R-DET-001).

@@ -24,6 +24,8 @@ pub(super) struct Start {
     failed: bool,
     /// An operator took the node out of operation: it stays so until an operator starts it.
     held: bool,
+    /// Its boot is done, or it needs none.
+    configured: bool,
     /// The last boot-up messages, oldest first.
     boots: [Option<Instant>; STORM_BOOTS],
     /// The node restarts again and again: it is not started before.
@@ -50,14 +52,15 @@ pub(super) struct StartDue {
 }
 
 impl Start {
-    /// Nothing under way.
-    pub(super) fn new(settings: StartSettings) -> Self {
+    /// Nothing under way. A node that is not `configured` yet is not started.
+    pub(super) fn new(settings: StartSettings, configured: bool) -> Self {
         Self {
             settings,
             phase: Phase::Idle,
             attempts: 0,
             failed: false,
             held: false,
+            configured,
             boots: [None; STORM_BOOTS],
             quiet_until: None,
         }
@@ -68,9 +71,23 @@ impl Start {
         self.held
     }
 
-    /// Whether its start waits because it restarts again and again.
+    /// Whether its start waits: it is not configured yet, or restarts again and again.
     pub(super) fn is_held_back(&self) -> bool {
-        self.quiet_until.is_some()
+        !self.configured || self.quiet_until.is_some()
+    }
+
+    /// The boot of the node begins anew: it is not started before that is done.
+    pub(super) fn handle_boot_begun(&mut self) {
+        self.configured = false;
+        self.cancel();
+    }
+
+    /// The boot of the node is done: a start command is due, unless the node is operational already.
+    pub(super) fn handle_boot_done(&mut self, now: Instant, operational: bool) {
+        self.configured = true;
+        if self.settings.auto_start && !self.held && !operational {
+            self.phase = Phase::Booting(self.quiet_until.map_or(now, |until| until.max(now)));
+        }
     }
 
     /// Whether a lost node is to be reset when it comes back.
@@ -89,7 +106,9 @@ impl Start {
         if storm {
             self.quiet_until = Some(now + STORM_WAIT);
         }
-        self.phase = Phase::Booting(self.quiet_until.unwrap_or(now + self.settings.delay));
+        if self.configured {
+            self.phase = Phase::Booting(self.quiet_until.unwrap_or(now + self.settings.delay));
+        }
         storm
     }
 
@@ -108,7 +127,11 @@ impl Start {
     /// The node reports pre-operational or stopped. `true`: a start command is due now (R-DET-017).
     pub(super) fn handle_idle_node(&self, now: Instant) -> bool {
         let held_back = self.quiet_until.is_some_and(|until| now < until);
-        self.settings.auto_start && !self.held && !held_back && !matches!(self.phase, Phase::Sent(_))
+        self.settings.auto_start
+            && self.configured
+            && !self.held
+            && !held_back
+            && !matches!(self.phase, Phase::Sent(_))
     }
 
     /// The node is operational, or sends TPDOs. `true`: after a failed start.
@@ -215,7 +238,7 @@ mod tests {
 
     #[test]
     fn r_det_020_start_is_repeated_and_fails_after_three_unanswered_commands() {
-        let mut start = Start::new(StartSettings::default());
+        let mut start = Start::new(StartSettings::default(), true);
         assert!(start.handle_idle_node(at(0)));
         start.sent(at(0));
         assert!(!start.handle_idle_node(at(0)), "one command at a time");
@@ -231,7 +254,7 @@ mod tests {
 
     #[test]
     fn r_det_019_start_after_boot_up_waits_for_the_delay_at_most() {
-        let mut start = Start::new(StartSettings::default());
+        let mut start = Start::new(StartSettings::default(), true);
         start.handle_boot_up(at(100));
         assert_eq!(start.poll_timeout(), Some((at(600), "start after boot-up")));
         assert!(start.handle_idle_node(at(0)), "a report of pre-operational starts at once");
@@ -241,7 +264,7 @@ mod tests {
 
     #[test]
     fn f14_a_node_that_boots_three_times_within_ten_seconds_is_started_after_thirty_seconds() {
-        let mut start = Start::new(StartSettings::default());
+        let mut start = Start::new(StartSettings::default(), true);
         assert!(!start.handle_boot_up(at(0)));
         assert!(!start.handle_boot_up(at(1000)));
         assert!(start.handle_boot_up(at(2000)), "the third");
@@ -259,7 +282,7 @@ mod tests {
 
     #[test]
     fn r_det_020_a_failed_start_is_told_again_after_an_operator_ordered_another() {
-        let mut start = Start::new(StartSettings::default());
+        let mut start = Start::new(StartSettings::default(), true);
         for ordered_at in [0, 60_000] {
             start.release();
             for attempt in 0..3 {
@@ -271,7 +294,7 @@ mod tests {
 
     #[test]
     fn r_det_017_a_node_that_an_operator_stopped_stays_stopped() {
-        let mut start = Start::new(StartSettings::default());
+        let mut start = Start::new(StartSettings::default(), true);
         start.hold();
         assert!(!start.handle_idle_node(at(0)));
         start.handle_boot_up(at(0));
@@ -282,7 +305,7 @@ mod tests {
 
     #[test]
     fn r_det_017_without_auto_start_nothing_is_started() {
-        let mut start = Start::new(StartSettings { auto_start: false, ..StartSettings::default() });
+        let mut start = Start::new(StartSettings { auto_start: false, ..StartSettings::default() }, true);
         start.handle_boot_up(at(0));
         assert!(!start.handle_idle_node(at(0)));
         assert_eq!(start.poll_timeout(), None);
@@ -290,7 +313,7 @@ mod tests {
 
     #[test]
     fn a_command_that_did_not_leave_is_no_attempt() {
-        let mut start = Start::new(StartSettings::default());
+        let mut start = Start::new(StartSettings::default(), true);
         for millis in [0, 1000, 2000, 3000, 4000] {
             start.sent(at(millis));
             start.handle_not_sent();
@@ -300,7 +323,7 @@ mod tests {
 
     #[test]
     fn a_start_that_the_bus_interrupted_goes_on() {
-        let mut start = Start::new(StartSettings::default());
+        let mut start = Start::new(StartSettings::default(), true);
         start.sent(at(0));
         start.pause();
         assert_eq!(due(&mut start, 9000), None);

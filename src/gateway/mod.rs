@@ -12,6 +12,7 @@
 //! - [`replay`]: a recording through the same core.
 //! - [`task`] \[IO\]: owns the gateway and the image's writer.
 
+mod boot_event;
 mod bus;
 pub mod command;
 mod conditions;

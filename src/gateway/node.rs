@@ -23,6 +23,8 @@ pub(super) struct Node {
     /// It restarts again and again, so that its start waits.
     pub(super) start_held_back: bool,
     pub(super) stop_ordered: bool,
+    /// Why its boot failed last.
+    pub(super) boot_trouble: Option<BootTrouble>,
     /// A frame came at any time since the gateway started.
     pub(super) ever_seen: bool,
     /// The journal tells that it was lost.
@@ -41,6 +43,17 @@ pub(super) struct Node {
     pub(super) reserved: Vec<u64>,
     /// By TPDO: that it is too long has been told.
     pub(super) told_too_long: Vec<bool>,
+}
+
+/// Why a node cannot be booted.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum BootTrouble {
+    /// It does not answer SDO requests. Where it is not there at all, that is told otherwise.
+    NoAnswer,
+    /// It is not the device that the mapping is for.
+    OtherDevice(String),
+    /// An object could not be read or written.
+    Configuration(String),
 }
 
 /// How a node was lost.
@@ -67,6 +80,7 @@ impl Node {
             start_failed: None,
             start_held_back: false,
             stop_ordered: false,
+            boot_trouble: None,
             ever_seen: false,
             told_lost: false,
             duplicate: false,
@@ -151,6 +165,15 @@ impl Node {
         if !self.contact {
             return "waiting for its first frame".to_owned();
         }
+        match &self.boot_trouble {
+            Some(BootTrouble::NoAnswer) => {
+                return format!("node {id} answers no SDO request, so it is not started");
+            }
+            Some(BootTrouble::OtherDevice(why) | BootTrouble::Configuration(why)) => {
+                return format!("not started: {why}");
+            }
+            None => {}
+        }
         if let Some(attempts) = self.start_failed {
             return format!("{attempts} start commands had no effect");
         }
@@ -205,7 +228,8 @@ impl Gateway {
         let suspect_until = node.suspect_until.filter(|until| *until > now.instant);
         // A node that never was there was not lost: that has an alarm of its own, which names other causes.
         let (lost, never_seen) = (node.lost.is_some() && node.ever_seen, node.never_seen);
-        let start_failed = node.start_failed.is_some() || node.start_held_back;
+        let boot_failed = node.contact && node.boot_trouble.is_some();
+        let start_failed = node.start_failed.is_some() || node.start_held_back || boot_failed;
         let (duplicate, foreign_guard) = (node.duplicate, node.foreign_guard);
         self.raise(now, owner, BuiltIn::NodeLost, lost, quiet_until);
         self.conditions.set(now, owner, BuiltIn::NodeNeverSeen, never_seen);

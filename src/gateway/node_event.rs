@@ -17,6 +17,9 @@ impl Gateway {
     pub(super) fn node_event(&mut self, now: Now, index: NodeIndex, event: &NodeEvent) {
         let at = (now, index);
         match *event {
+            NodeEvent::Boot(ref told) => self.boot_event(at, told),
+            // Nobody asks for transfers but the boot, which keeps its results to itself.
+            NodeEvent::Sdo { .. } => {}
             NodeEvent::FrameSeen => return self.frame_seen(at),
             NodeEvent::Pdo { pdo, data, length } => return self.pdo(at, pdo, data, length),
             NodeEvent::PdoLength { pdo, received, discarded } => {
@@ -348,7 +351,7 @@ impl Gateway {
         });
     }
 
-    fn change(&mut self, index: NodeIndex, change: impl FnOnce(&mut Node)) {
+    pub(super) fn change(&mut self, index: NodeIndex, change: impl FnOnce(&mut Node)) {
         if let Some(node) = self.nodes.get_mut(index.0) {
             change(node);
         }
@@ -362,12 +365,17 @@ impl Gateway {
         }
     }
 
-    fn tell(&mut self, (now, index): (Now, NodeIndex), name: &'static str, fill: impl FnOnce(&mut Event)) {
+    pub(super) fn tell(
+        &mut self,
+        (now, index): (Now, NodeIndex),
+        name: &'static str,
+        fill: impl FnOnce(&mut Event),
+    ) {
         self.events.record(now, AlarmOwner::Node(index), Name::Word(name), fill);
     }
 
     /// The number of a TPDO as users know it.
-    fn pdo_number(&self, index: NodeIndex, pdo: PdoIndex) -> u16 {
+    pub(super) fn pdo_number(&self, index: NodeIndex, pdo: PdoIndex) -> u16 {
         let settings = self.table.nodes.get(index.0).and_then(|def| def.canopen.pdos.get(pdo.0));
         settings.map_or(0, |pdo| pdo.number)
     }

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use crate::can::CanId;
+use crate::canopen::boot::BootSettings;
 use crate::canopen::{
     ErrorControl, GuardingSettings, Network, NetworkOutput, NetworkSettings, NmtRequest, NodeEvent, NodeId,
     NodeSettings, PdoSettings, Role, StartSettings,
@@ -121,6 +122,8 @@ pub(super) fn detcon(id: u8) -> NodeSettings {
         id: NodeId::new(id).unwrap(),
         error_control: ErrorControl::Guarding(GuardingSettings::default()),
         start: StartSettings::default(),
+        sdo: None,
+        boot: BootSettings::default(),
         pdos: [(1, 8), (2, 8), (3, 8), (4, 6)].into_iter().map(pdo).collect(),
         never_seen_after: Duration::from_secs(10),
     }

@@ -2,11 +2,13 @@
 //!
 //! - `bench`: frames in candump notation in, lines of text out.
 //! - `worked_examples`: guarding and boot-up, step by step.
+//! - `boot`: a node that is configured before it is started.
 //! - `duties`: starting, orders, TPDOs, heartbeat.
 //! - `surroundings`: other masters, strangers, duplicate ids, the passive role, a bus that fails.
 //! - `properties`: random input; a day of quiet guarding.
 
 mod bench;
+mod boot;
 mod duties;
 mod properties;
 mod surroundings;

@@ -8,6 +8,7 @@ use super::super::file::{MappingFile, TpdoSection};
 use super::super::installation::ErrorControlWord;
 use super::problems::Problems;
 use super::tags::Context;
+use crate::canopen::boot::BootSettings;
 use crate::canopen::{ErrorControl, GuardingSettings, NodeId, NodeSettings, PdoSettings, StartSettings};
 
 /// A node that has shown no frame for so long after the start is reported (R-DET-001).
@@ -21,6 +22,8 @@ pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> N
         id,
         error_control: error_control(problems, context),
         start: start(problems, context),
+        sdo: None,
+        boot: BootSettings::default(),
         pdos: context.tpdos.iter().map(|tpdo| pdo(problems, context, id, tpdo.key, tpdo.section)).collect(),
         never_seen_after: NEVER_SEEN_AFTER,
     }

@@ -1,0 +1,86 @@
+//! What is done with a node before it is started. Plain data.
+
+use std::time::Duration;
+
+use crate::canopen::PdoIndex;
+use crate::canopen::object::{MappedObject, ObjectId};
+
+/// How a node is booted.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BootSettings {
+    /// What is done, in this order; empty: nothing, the node may be started at once.
+    pub steps: Vec<BootStep>,
+    /// A boot that failed begins anew after this long, then after twice as long, and so on.
+    pub retry: Duration,
+    /// But never more seldom than this.
+    pub longest_retry: Duration,
+}
+
+impl Default for BootSettings {
+    fn default() -> Self {
+        Self { steps: Vec::new(), retry: Duration::from_secs(1), longest_retry: Duration::from_secs(30) }
+    }
+}
+
+/// One step.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum BootStep {
+    /// The object must have this value, else it is another device (0x1000, 0x1018; R-DST-001).
+    Identity {
+        /// Which.
+        object: ObjectId,
+        /// Its value.
+        expected: u32,
+    },
+    /// Reads an object and tells its value. That the node does not have it is told too, and no failure.
+    Read {
+        /// Which.
+        object: ObjectId,
+    },
+    /// Sees to it that an object has this value: reads it, writes it where it differs, and reads it again.
+    Write {
+        /// Which.
+        object: ObjectId,
+        /// Its bytes, little-endian.
+        data: Vec<u8>,
+        /// A node that refuses is started all the same (K-DST-15).
+        optional: bool,
+    },
+    /// Reads a TPDO's communication and mapping parameters and tells them; changes them first where it is asked to.
+    Pdo(PdoSetup),
+    /// Stores all parameters in the node (0x1010:1), if any of the steps before wrote something.
+    Save,
+}
+
+/// A TPDO as it should be.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PdoSetup {
+    /// Which, by its place in the node's settings.
+    pub pdo: PdoIndex,
+    /// TPDO number, 1..=512: its objects are 0x1800 and 0x1A00 plus this number less one.
+    pub number: u16,
+    /// What is done where the node has it otherwise.
+    pub mode: MappingMode,
+    /// Its content, in order.
+    pub maps: Vec<MappedObject>,
+    /// Transmission type (sub-index 2); `None`: as it is.
+    pub transmission_type: Option<u8>,
+    /// Inhibit time in units of 100 us (sub-index 3); `None`: as it is.
+    pub inhibit_time: Option<u16>,
+    /// Event timer in ms (sub-index 5); `None`: as it is.
+    pub event_timer: Option<u16>,
+    /// Mark the PDO as not valid (bit 31 of its COB-ID) while its mapping is changed (R-DST-023).
+    pub set_invalid: bool,
+}
+
+/// What is done where a node has another PDO mapping than the mapping file (R-DST-024).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum MappingMode {
+    /// It is changed in the node.
+    #[default]
+    Write,
+    /// It is told, and decoded as the node has it.
+    Verify,
+    /// It is decoded as the node has it, without a word.
+    Adopt,
+}

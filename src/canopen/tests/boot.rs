@@ -1,0 +1,342 @@
+//! A node that is configured before it is started, against a device in the form of a table of objects.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use super::bench::{detcon, master};
+use crate::can::{CanFrame, CanId};
+use crate::canopen::boot::{BootEvent, BootFailure, BootSettings, BootStep, MappingMode, PdoSetup};
+use crate::canopen::object::{MappedObject, ObjectId};
+use crate::canopen::sdo::SdoSettings;
+use crate::canopen::{
+    ErrorControl, Network, NetworkOutput, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex, PdoSettings,
+};
+use crate::time::{Instant, Now};
+
+const fn object(index: u16, sub: u8) -> ObjectId {
+    ObjectId::new(index, sub)
+}
+
+/// A device of the kind of DST P92C: expedited SDO, heartbeat every 500 ms once its producer time is set, one TPDO.
+struct Device {
+    objects: BTreeMap<ObjectId, Vec<u8>>,
+    state: NmtState,
+    /// Objects in the order in which they were written, and the state in which.
+    writes: Vec<(ObjectId, NmtState)>,
+    refuse: Option<(ObjectId, u32)>,
+    mute: bool,
+}
+
+impl Device {
+    fn new() -> Self {
+        let objects = [
+            (object(0x1000, 0), 0x0002_0194_u32.to_le_bytes().to_vec()),
+            (object(0x1010, 1), 1_u32.to_le_bytes().to_vec()),
+            (object(0x1017, 0), 0_u16.to_le_bytes().to_vec()),
+            (object(0x1018, 1), 0x23D_u32.to_le_bytes().to_vec()),
+            (object(0x1800, 1), 0x181_u32.to_le_bytes().to_vec()),
+            (object(0x1800, 2), vec![1]),
+            (object(0x1800, 3), vec![0, 0]),
+            (object(0x1800, 5), 1000_u16.to_le_bytes().to_vec()),
+            (object(0x1A00, 0), vec![2]),
+            (object(0x1A00, 1), 0x9130_0120_u32.to_le_bytes().to_vec()),
+            (object(0x1A00, 2), 0x6150_0108_u32.to_le_bytes().to_vec()),
+            (object(0x6131, 1), 0x0022_0000_u32.to_le_bytes().to_vec()),
+        ];
+        Self {
+            objects: objects.into_iter().collect(),
+            state: NmtState::PreOperational,
+            writes: Vec::new(),
+            refuse: None,
+            mute: false,
+        }
+    }
+
+    fn answer(&mut self, request: &CanFrame) -> Option<CanFrame> {
+        let reply = |data: [u8; 8]| CanFrame::data_frame(CanId::Standard(0x581), &data);
+        if request.id() == CanId::Standard(0) {
+            self.state = match request.data()[0] {
+                1 => NmtState::Operational,
+                2 => NmtState::Stopped,
+                _ => NmtState::PreOperational,
+            };
+            return None;
+        }
+        if self.mute || request.id() != CanId::Standard(0x601) {
+            return None;
+        }
+        let data: [u8; 8] = request.data().try_into().unwrap();
+        let (low, high, sub) = (data[1], data[2], data[3]);
+        let object = ObjectId::new(u16::from_le_bytes([low, high]), sub);
+        if let Some((refused, code)) = self.refuse
+            && refused == object
+            && data[0] != 0x40
+        {
+            let [a, b, c, d] = code.to_le_bytes();
+            return reply([0x80, low, high, sub, a, b, c, d]);
+        }
+        if data[0] == 0x40 {
+            let Some(value) = self.objects.get(&object) else {
+                return reply([0x80, low, high, sub, 0, 0, 2, 6]);
+            };
+            let mut answer = [0x43 | u8::try_from(4 - value.len()).unwrap() << 2, low, high, sub, 0, 0, 0, 0];
+            answer[4..4 + value.len()].copy_from_slice(value);
+            return reply(answer);
+        }
+        let length = 4 - usize::from(data[0] >> 2 & 3);
+        self.objects.insert(object, data[4..4 + length].to_vec());
+        self.writes.push((object, self.state));
+        reply([0x60, low, high, sub, 0, 0, 0, 0])
+    }
+}
+
+struct Plant {
+    network: Network,
+    device: Device,
+    now: u64,
+    told: Vec<BootEvent>,
+    nmt: Vec<String>,
+}
+
+fn setup(mode: MappingMode, set_invalid: bool) -> PdoSetup {
+    let maps = [0x6130_0120, 0x9130_0220].map(MappedObject::from_entry).to_vec();
+    PdoSetup {
+        pdo: PdoIndex(0),
+        number: 1,
+        mode,
+        maps,
+        transmission_type: Some(255),
+        inhibit_time: None,
+        event_timer: Some(100),
+        set_invalid,
+    }
+}
+
+fn steps() -> Vec<BootStep> {
+    vec![
+        BootStep::Identity { object: object(0x1000, 0), expected: 0x0002_0194 },
+        BootStep::Identity { object: object(0x1018, 1), expected: 0x23D },
+        BootStep::Write { object: object(0x1017, 0), data: 500_u16.to_le_bytes().to_vec(), optional: false },
+        BootStep::Pdo(setup(MappingMode::Write, false)),
+        BootStep::Read { object: object(0x6131, 1) },
+        BootStep::Save,
+    ]
+}
+
+impl Plant {
+    fn new(steps: Vec<BootStep>) -> Self {
+        let node = NodeSettings {
+            error_control: ErrorControl::Heartbeat { timeout: Duration::from_millis(1500) },
+            sdo: Some(SdoSettings::default()),
+            boot: BootSettings { steps, ..BootSettings::default() },
+            pdos: vec![PdoSettings {
+                number: 1,
+                cob_id: CanId::Standard(0x181),
+                length: 8,
+                strict_length: false,
+                timeout: None,
+                shortest_period: None,
+            }],
+            ..detcon(1)
+        };
+        let network = Network::new(master(vec![node]), Now::from_millis(0));
+        Self { network, device: Device::new(), now: 0, told: Vec::new(), nmt: Vec::new() }
+    }
+
+    fn drain(&mut self) {
+        while let Some(output) = self.network.poll_output() {
+            match output {
+                NetworkOutput::Transmit(frame) => {
+                    if frame.id() == CanId::Standard(0) {
+                        self.nmt.push(frame.to_string());
+                        self.device.answer(&frame);
+                        let state = [self.device.state.code()];
+                        let heartbeat = CanFrame::data_frame(CanId::Standard(0x701), &state).unwrap();
+                        self.network.handle_frame(Now::from_millis(self.now), &heartbeat);
+                    }
+                    if let Some(answer) = self.device.answer(&frame) {
+                        self.network.handle_frame(Now::from_millis(self.now), &answer);
+                    }
+                }
+                NetworkOutput::Node(_, NodeEvent::Boot(event)) => self.told.push(event),
+                NetworkOutput::Node(..) | NetworkOutput::Foreign(_) => {}
+            }
+        }
+    }
+
+    fn frame(&mut self, text: &str) {
+        self.network.handle_frame(Now::from_millis(self.now), &text.parse().unwrap());
+        self.drain();
+    }
+
+    fn run(&mut self, millis: u64) -> &mut Self {
+        let end = self.now + millis;
+        while let Some((at, _)) =
+            self.network.poll_timeout().filter(|(at, _)| *at <= Instant::from_millis(end))
+        {
+            self.now = self.now.max(at.as_micros().div_ceil(1000));
+            self.network.handle_timeout(Now::from_millis(self.now));
+            self.drain();
+        }
+        self.now = end;
+        self
+    }
+
+    fn link_up(&mut self) -> &mut Self {
+        self.network.handle_link(Now::from_millis(self.now), true);
+        self.drain();
+        self.run(1400)
+    }
+
+    fn written(&self) -> Vec<String> {
+        self.device.writes.iter().map(|(object, _)| object.to_string()).collect()
+    }
+}
+
+#[test]
+fn r_dst_024_a_node_is_identified_configured_in_the_right_order_and_then_started() {
+    let mut plant = Plant::new(steps());
+    plant.link_up();
+    let expected =
+        ["0x1017:0", "0x1800:2", "0x1800:5", "0x1A00:0", "0x1A00:1", "0x1A00:2", "0x1A00:0", "0x1010:1"];
+    assert_eq!(plant.written(), expected);
+    assert_eq!(plant.device.objects[&object(0x1A00, 1)], 0x6130_0120_u32.to_le_bytes());
+    assert_eq!(plant.device.objects[&object(0x1A00, 0)], [2]);
+    assert_eq!(plant.nmt, ["000#0101"], "started once, when all is done");
+    assert!(plant.told.contains(&BootEvent::Object {
+        object: object(0x6131, 1),
+        data: Some(0x0022_0000_u32.to_le_bytes().to_vec())
+    }));
+    assert_eq!(plant.told.last(), Some(&BootEvent::Done { written: 7 }));
+}
+
+#[test]
+fn r_dst_090_a_gateway_that_starts_again_writes_nothing_and_does_not_stop_the_node() {
+    let mut plant = Plant::new(steps());
+    plant.link_up();
+    let mut again = Plant::new(steps());
+    again.device = plant.device;
+    again.device.writes.clear();
+    again.frame("701#05");
+    again.link_up();
+    assert_eq!(again.written(), Vec::<String>::new());
+    assert_eq!(again.nmt, Vec::<String>::new());
+    assert_eq!(again.told.last(), Some(&BootEvent::Done { written: 0 }));
+}
+
+#[test]
+fn r_dst_023_an_operational_node_is_made_pre_operational_before_its_mapping_is_changed() {
+    let mut plant = Plant::new(vec![BootStep::Pdo(setup(MappingMode::Write, true))]);
+    plant.device.state = NmtState::Operational;
+    plant.frame("701#05");
+    plant.link_up();
+    assert_eq!(plant.nmt, ["000#8001", "000#0101"]);
+    assert!(plant.device.writes.iter().all(|(_, state)| *state == NmtState::PreOperational));
+    let expected =
+        ["0x1800:2", "0x1800:5", "0x1800:1", "0x1A00:0", "0x1A00:1", "0x1A00:2", "0x1A00:0", "0x1800:1"];
+    assert_eq!(plant.written(), expected);
+    assert_eq!(
+        plant.device.objects[&object(0x1800, 1)],
+        0x181_u32.to_le_bytes(),
+        "valid again, else as it was"
+    );
+}
+
+#[test]
+fn r_dst_001_another_device_is_not_started_and_the_letter_says_why() {
+    let mut plant = Plant::new(steps());
+    plant.device.objects.insert(object(0x1018, 1), 0x1_u32.to_le_bytes().to_vec());
+    plant.link_up().run(60_000);
+    assert_eq!(plant.nmt, Vec::<String>::new());
+    assert_eq!(plant.written(), Vec::<String>::new());
+    let expected =
+        BootFailure::Identity { object: object(0x1018, 1), expected: 0x23D, found: 1, letter: 'D' };
+    assert_eq!(plant.told, [BootEvent::Failed(expected)], "told once, though it is tried again");
+    plant.frame("701#7F");
+    assert_eq!(plant.nmt, Vec::<String>::new());
+}
+
+#[test]
+fn r_dst_053_a_silent_node_is_asked_ever_more_seldom_and_at_once_when_it_shows_itself() {
+    let mut plant = Plant::new(steps());
+    plant.device.mute = true;
+    plant.link_up().run(120_000);
+    assert_eq!(plant.told, [BootEvent::Failed(BootFailure::NoAnswer)]);
+    plant.device.mute = false;
+    plant.frame("081#11F0210000000000");
+    plant.run(1000);
+    assert!(plant.told.contains(&BootEvent::Done { written: 7 }), "R-DST-052: an EMCY is a sign of life");
+    assert_eq!(plant.nmt, ["000#0101"]);
+}
+
+#[test]
+fn r_dst_064_a_boot_up_message_begins_everything_anew() {
+    let mut plant = Plant::new(steps());
+    plant.link_up();
+    plant.told.clear();
+    plant.device.objects = Device::new().objects;
+    plant.device.state = NmtState::PreOperational;
+    plant.frame("701#00");
+    plant.run(1000);
+    assert_eq!(plant.told.last(), Some(&BootEvent::Done { written: 7 }));
+    assert_eq!(plant.nmt, ["000#0101", "000#0101"]);
+}
+
+#[test]
+fn r_dst_024_verify_tells_and_adopt_takes_what_the_node_has() {
+    for (mode, tells) in [(MappingMode::Verify, true), (MappingMode::Adopt, false)] {
+        let mut plant = Plant::new(vec![BootStep::Pdo(setup(mode, false))]);
+        plant.link_up();
+        assert_eq!(plant.written(), Vec::<String>::new(), "{mode:?}");
+        let deviation = plant.told.contains(&BootEvent::Deviation { pdo: PdoIndex(0) });
+        assert_eq!(deviation, tells, "{mode:?}");
+        let mapped = plant
+            .told
+            .iter()
+            .find_map(|event| if let BootEvent::Mapped(mapped) = event { Some(mapped) } else { None });
+        let mapped = mapped.unwrap();
+        assert_eq!(mapped.length(), 5);
+        assert_eq!(
+            mapped.maps.iter().map(|each| each.entry()).collect::<Vec<_>>(),
+            [0x9130_0120, 0x6150_0108]
+        );
+        plant.frame("181#A086010000");
+    }
+}
+
+#[test]
+fn r_dst_119_a_tpdo_on_another_identifier_is_taken_from_there() {
+    let mut plant = Plant::new(vec![BootStep::Pdo(setup(MappingMode::Adopt, false))]);
+    plant.device.objects.insert(object(0x1800, 1), 0x1A5_u32.to_le_bytes().to_vec());
+    plant.link_up();
+    let node = NodeId::new(1).unwrap();
+    let received = |plant: &mut Plant, frame: &str| {
+        plant.network.handle_frame(Now::from_millis(plant.now), &frame.parse().unwrap());
+        std::iter::from_fn(|| plant.network.poll_output())
+            .any(|output| matches!(output, NetworkOutput::Node(id, NodeEvent::Pdo { .. }) if id == node))
+    };
+    assert!(received(&mut plant, "1A5#A086010000"));
+    assert!(!received(&mut plant, "181#A086010000"));
+}
+
+#[test]
+fn k_dst_15_a_setting_that_may_be_refused_does_not_keep_the_node_from_starting() {
+    let write = |optional| BootStep::Write { object: object(0x6131, 1), data: vec![0, 0, 0x4E, 0], optional };
+    for optional in [true, false] {
+        let mut plant = Plant::new(vec![write(optional)]);
+        plant.device.refuse = Some((object(0x6131, 1), 0x0609_0030));
+        plant.link_up();
+        assert_eq!(plant.nmt.len(), usize::from(optional));
+    }
+}
+
+#[test]
+fn r_dst_071_a_stopped_node_is_made_pre_operational_before_it_is_asked() {
+    let mut plant = Plant::new(steps());
+    plant.network.handle_link(Now::from_millis(0), true);
+    plant.frame("701#04");
+    plant.device.state = NmtState::Stopped;
+    plant.run(3000);
+    assert_eq!(plant.nmt.first().map(String::as_str), Some("000#8001"));
+    assert_eq!(plant.nmt.last().map(String::as_str), Some("000#0101"));
+}
