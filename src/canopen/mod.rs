@@ -13,7 +13,7 @@
 //! - [`object`]: objects of an object dictionary, and their values as text.
 //! - [`sdo`]: reads and writes them; [`lss`]: gives devices node ids and bit rates.
 //! - [`event`]: what a network tells.
-//! - [`boot`]: what is done with a node before it is started; [`sdo`]: reading and writing its objects.
+//! - [`boot`]: what is done with a node before it is started.
 //! - `guarding`, `heartbeat`, `start`, `pdo`, `duplicate`: one machine each, for one node.
 //! - `node`: one node, made of those machines; `reception`: what its frames mean for it.
 //! - `network`: all nodes of a bus; dispatches frames.

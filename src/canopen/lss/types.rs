@@ -238,6 +238,8 @@ pub enum LssAnswer {
     Changed {
         /// It is in effect: the node booted with it. Else it takes effect when the device is switched off and on.
         active: bool,
+        /// NMT states and heartbeat are as they were before.
+        restored: bool,
     },
 }
 
@@ -251,9 +253,10 @@ pub enum LssDuty {
     WriteHeartbeat(NodeId, u16),
     /// Send this NMT request to one node or all, and remember the states that the nodes had.
     Nmt(Option<NodeId>, NmtRequest),
-    /// Set our own interface to this bit rate.
+    /// Set our own interface to this bit rate; answer when the bus can be used again.
     ChangeInterface(LssBitRate),
-    /// Wait for the boot-up message of this node; answer [`Performed::No`] when none came within the time.
+    /// Wait for the boot-up message of this node, which may have come at any time after the last frame of the job was sent;
+    /// answer [`Performed::No`] when none came within the time.
     AwaitBootUp(NodeId, Duration),
     /// Read 0x1018 of this node by SDO; answer [`Performed::No`] when it is another address.
     CheckIdentity(NodeId, LssAddress),

@@ -6,13 +6,7 @@ use std::time::Duration;
 
 use proptest::prelude::*;
 
-use super::server::{Abilities, Server};
-use super::{SdoAction, SdoClient, SdoError, SdoOutput, SdoRequest, SdoSettings, TransferId};
-use crate::can::{CanFrame, CanId};
-use crate::canopen::NodeId;
-use crate::canopen::object::ObjectId;
-use crate::canopen::sdo::answer_id;
-use crate::time::Instant;
+use super::*;
 
 type Payload = [u8; 8];
 
@@ -175,12 +169,12 @@ impl Bench {
             for answer in self.server.handle(payload) {
                 self.to_client.send(&mut self.random, self.faults, self.now, delay, answer, 0);
             }
-            for (object, value) in self.server.writes[written..].to_vec() {
+            for (object, value) in self.server.writes[written..].iter().cloned() {
                 self.history.entry(object).or_default().push((self.now, value));
             }
         } else if answer <= self.now {
             let (_, payload, _) = self.to_client.frames.pop_front().unwrap();
-            let frame = CanFrame::data_frame(answer_id(NodeId::new(1).unwrap()), &payload).unwrap();
+            let frame = CanFrame::data_frame(CanId::Standard(0x581), &payload).unwrap();
             self.client.handle_answer(Instant::from_millis(self.now), &frame);
         } else {
             self.client.handle_timeout(Instant::from_millis(self.now));

@@ -217,7 +217,7 @@ impl Server {
     }
 
     fn block_upload(&mut self, object: ObjectId, request: Payload) -> Vec<Payload> {
-        if request[0] & 3 == 0 {
+        if request[0].is_multiple_of(4) {
             if !self.abilities.blocks {
                 return self.abort(object, 0x0504_0001);
             }
