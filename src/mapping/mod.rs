@@ -9,6 +9,7 @@
 //! - [`build`](mod@build): from both to the tag table, or to everything that is wrong.
 //! - [`builtin`]: the alarms that every gateway, bus and node has.
 //! - [`table`]: the result.
+//! - [`eds`]: mappings made from EDS and DCF files.
 //! - [`expression`]: conditions on tags; [`expression_parser`] reads them.
 //! - [`objection`]: why a value should not be used as it stands.
 //! - [`codec`]: raw bits to values, values to registers.
@@ -19,6 +20,7 @@ pub mod build;
 pub mod builtin;
 pub mod codec;
 pub mod diagnostic;
+pub mod eds;
 pub mod expression;
 pub mod expression_parser;
 pub mod file;
