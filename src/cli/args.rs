@@ -41,6 +41,8 @@ pub enum Subcommand {
     Check(CheckArguments),
     /// Print the register and topic map of a configuration, or what differs between two maps.
     Map(MapArguments),
+    /// Make a device mapping from an EDS or DCF, or update one.
+    Import(ImportArguments),
     /// Put a simulated device on an interface.
     Sim(SimArguments),
     /// Run a candump log through the gateway; the same log gives the same output, always.
@@ -117,6 +119,18 @@ pub enum MapCommand {
         /// The newer map.
         new: PathBuf,
     },
+}
+
+/// `cangate import`
+#[derive(Args, Debug)]
+pub struct ImportArguments {
+    /// The EDS or DCF.
+    #[arg(value_name = "FILE")]
+    pub file: PathBuf,
+    /// Where to; standard output without it. A file of a former import is updated: its names, addresses and what was
+    /// written by hand stay.
+    #[arg(short, long, value_name = "FILE")]
+    pub output: Option<PathBuf>,
 }
 
 /// `cangate sim`

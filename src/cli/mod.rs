@@ -8,6 +8,7 @@ pub mod check;
 mod completions;
 mod demo;
 mod health;
+mod import;
 mod load;
 mod man;
 mod map;
@@ -84,6 +85,7 @@ fn dispatch(command: Subcommand) -> Exit {
         Subcommand::Demo(options) => demo::run(&options),
         Subcommand::Check(options) => check::run(&options),
         Subcommand::Map(options) => map::run(&options),
+        Subcommand::Import(options) => import::run(&options),
         Subcommand::Sim(options) => sim::command(&options),
         Subcommand::Replay(options) => replay::run(&options),
         Subcommand::Schema(options) => schema::run(&options),
@@ -120,6 +122,7 @@ mod tests {
             &["check", "a.toml"],
             &["map", "--format", "csv"],
             &["map", "diff", "a.json", "b.json"],
+            &["import", "a.eds", "-o", "a.toml"],
             &["sim", "detcon", "-i", "vcan0", "--node", "1"],
             &["replay", "bus.log"],
             &["schema", "config"],
