@@ -5,6 +5,7 @@
 //! | `architecture` | which room may import which; file sizes; what the pure rooms must not touch |
 //! | `conversations` | the gateway core against scripted frames, in candump notation |
 //! | `devices` | the gateway core against our simulators, with loss, delay and duplicates |
+//! | `eds` | EDS and DCF files of any quality become mappings; an import moves nothing that it gave away |
 //! | `mappings` | every shipped mapping checks; every message about a wrong one says what, where and how to mend it |
 //! | `contract` | golden files: register map, topics, payloads. Never edited to pass |
 //! | `modbus_server` | the Modbus TCP server over loopback sockets |
@@ -42,6 +43,7 @@ mod contract_mqtt;
 mod conversations;
 mod devices;
 mod documents;
+mod eds;
 mod lifecycle;
 mod mappings;
 mod modbus_server;
