@@ -127,6 +127,20 @@ fn r_esd_120_and_121_addresses_names_and_what_was_changed_by_hand_stay() {
 }
 
 #[test]
+fn a_tpdo_that_waits_for_a_sync_is_told() {
+    let text = device(&[(1, "A", 3, 16)]) + "[1800sub2]\nDataType=5\nAccessType=rw\nDefaultValue=";
+    let told = |number: &str| messages(&imported(&eds(&(text.clone() + number)), None)).concat();
+    assert_eq!(told("1"), "TPDO 1 is sent after a SYNC only");
+    assert_eq!(told("240"), told("0"));
+    assert_eq!((told("254"), told("255")), (String::new(), String::new()));
+    let first = imported(&eds(&(text.clone() + "1")), None).text;
+    let by_hand =
+        first.replace("transmission_type = 1", "transmission_type = 255").replace("\"verify\"", "\"write\"");
+    let second = imported(&eds(&(text.clone() + "1")), Some(&by_hand));
+    assert_eq!((second.text.as_str(), messages(&second)), (by_hand.as_str(), Vec::new()));
+}
+
+#[test]
 fn every_tag_that_is_gone_is_told() {
     let first = imported(&eds(&device(&[(1, "A 1", 3, 16), (2, "A 2", 3, 16), (3, "B", 3, 16)])), None);
     let second = imported(&eds(&device(&[(3, "B", 3, 16)])), Some(&first.text));
@@ -271,8 +285,8 @@ fn r_esd_122_bits_leave_room_for_the_alarms_and_wide_numbers_stand_in_no_registe
     let near = near.replace("bits_used = 0", "bits_used = 127");
     let two: String = text.split_inclusive("PDOMapping=1\n").skip(1).take(2).collect();
     let third = imported(&eds(&two), Some(&near));
-    assert_eq!(tag(&third.text, "0x2001:0")["bit_address"].as_integer(), Some(127));
-    assert_eq!(tag(&third.text, "0x2002:0")["bit_address"].as_integer(), Some(192));
+    assert_eq!(tag(&third.text, "0x2101:0")["bit_address"].as_integer(), Some(127));
+    assert_eq!(tag(&third.text, "0x2102:0")["bit_address"].as_integer(), Some(192));
     let wide = imported(&eds("[2000]\nParameterName=n\nDataType=0x1B\nAccessType=ro\nPDOMapping=1\n"), None);
     assert!(tag(&wide.text, "0x2000:0").get("registers").is_none());
     let double =
@@ -294,8 +308,8 @@ fn r_esd_128_the_heartbeat_is_what_the_device_can() {
         "{ heartbeat_ms = 1000, heartbeat_timeout_ms = 2500, kind = \"heartbeat\" }"
     );
     assert_eq!(
-        control("[1017]\nDataType=6\nAccessType=const\nDefaultValue=200\n"),
-        "{ heartbeat_ms = 200, heartbeat_timeout_ms = 500, kind = \"heartbeat\" }"
+        control("[1017]\nDataType=6\nAccessType=const\nDefaultValue=100\n"),
+        "{ heartbeat_ms = 100, heartbeat_timeout_ms = 500, kind = \"heartbeat\" }"
     );
     assert_eq!(
         control(

@@ -98,22 +98,31 @@ fn sent(report: &mut Report, eds: &Eds, former: &Former) -> Vec<Tpdo> {
         }
     }
     sent.sort_by_key(|tpdo| tpdo.number);
-    if !found.off.is_empty() {
-        let off: Vec<String> = found
-            .off
-            .iter()
-            .filter(|number| sent.iter().all(|tpdo| tpdo.number != **number))
-            .filter(|number| !former.own_tpdos.contains_key(number))
-            .take(16)
-            .map(ToString::to_string)
-            .collect();
-        if !off.is_empty() {
-            let message = format!("TPDO {} of the device is off or empty by default", off.join(", "));
-            let hint = "to use it add a [tpdo.N] with mapping = \"write\" below what import writes";
-            report.warn(Place::START, message, hint);
-        }
-    }
+    let is_off = |number: &u16| {
+        sent.iter().all(|tpdo| tpdo.number != *number) && !former.own_tpdos.contains_key(number)
+    };
+    tell_tpdos(
+        report,
+        found.off.iter().copied().filter(is_off),
+        "of the device is off or empty by default",
+        "to use it add a [tpdo.N] with mapping = \"write\" below what import writes",
+    );
+    let on_sync = sent.iter().filter(|tpdo| matches!(tpdo.transmission_type, Some(0..=240)));
+    tell_tpdos(
+        report,
+        on_sync.map(|tpdo| tpdo.number),
+        "is sent after a SYNC only",
+        "something on the bus must produce SYNC; or write transmission_type = 255, an event_timer_ms and mapping = \"write\"",
+    );
     sent
+}
+
+/// One warning for several TPDOs, the first 16 of them by number.
+fn tell_tpdos(report: &mut Report, numbers: impl Iterator<Item = u16>, what: &str, hint: &str) {
+    let numbers: Vec<String> = numbers.take(16).map(|number| number.to_string()).collect();
+    if !numbers.is_empty() {
+        report.warn(Place::START, format!("TPDO {} {what}", numbers.join(", ")), hint);
+    }
 }
 
 /// A TPDO as a former text has it; its chunk is kept as it is, so only what tags need is read.
@@ -125,7 +134,10 @@ fn written(chunk: &Chunk, number: u16) -> Option<Tpdo> {
         number,
         cob_id: super::pdo::CobId { base: u32::try_from(whole.base).ok()?, plus_node_id: whole.plus_node_id },
         maps: chunk.maps()?,
-        transmission_type: None,
+        transmission_type: chunk
+            .entry()
+            .get("transmission_type")
+            .and_then(|number| u8::try_from(number.as_integer()?).ok()),
         event_timer_ms: None,
         inhibit_time_us: None,
         is_configured: true,

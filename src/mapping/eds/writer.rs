@@ -8,6 +8,8 @@ use super::setup;
 
 /// Heartbeat of a device that sends none by default, in ms.
 const HEARTBEAT_MS: u64 = 1000;
+/// Shortest time-out of a heartbeat, in ms.
+const SHORTEST_TIMEOUT_MS: u64 = 500;
 /// Longest time-out of a heartbeat, in ms.
 const LONGEST_TIMEOUT_MS: u64 = 65_535;
 
@@ -76,8 +78,8 @@ pub fn error_control(eds: &Eds, former: &Former) -> String {
     let heartbeat = object(0x1017)
         .and_then(|object| number(0x1017).or(object.access.is_writable().then_some(HEARTBEAT_MS)));
     if let Some(heartbeat) = heartbeat {
-        // Two lost in a row, and a half more for their delay.
-        let timeout = (heartbeat * 5 / 2).clamp(10, LONGEST_TIMEOUT_MS);
+        // Two lost in a row, and a half more for their delay; a busy host may be late by more than a fast heartbeat.
+        let timeout = (heartbeat * 5 / 2).clamp(SHORTEST_TIMEOUT_MS, LONGEST_TIMEOUT_MS);
         lines.push("kind = \"heartbeat\"".to_owned());
         lines.push(format!("heartbeat_ms = {}", heartbeat.min(LONGEST_TIMEOUT_MS)));
         lines.push(format!("heartbeat_timeout_ms = {timeout}"));
