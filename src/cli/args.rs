@@ -111,8 +111,11 @@ pub struct MapArguments {
 /// `cangate map diff`
 #[derive(Debug, clap::Subcommand)]
 pub enum MapCommand {
-    /// What differs between two maps written with `--format json`; exit code 1 where a published address or topic
-    /// changed its meaning.
+    /// What differs between two maps written with `--format json`; exit code 1 where a published address, or the topic of
+    /// what stands there, changed its meaning.
+    ///
+    /// Maps list what has an address. Topics without one are not compared: tags without a register, availability, alarms
+    /// of buses and of the gateway, bridge/... and event.
     Diff {
         /// The older map.
         old: PathBuf,

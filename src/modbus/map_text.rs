@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
 use super::gateway_block::MAP_VERSION;
+use super::map_st::structured_text;
 use super::points::{hash, hash_text};
 use super::{MapDocument, Point, RegisterMap, Table, WordOrder};
 
@@ -19,6 +20,8 @@ pub enum MapFormat {
     Json,
     /// Markdown, for the project's folder.
     Md,
+    /// IEC 61131-3 structured text: the addresses as constants, for a PLC project.
+    St,
 }
 
 /// The whole map as a text that ends with a line feed.
@@ -30,6 +33,7 @@ pub fn render(map: &RegisterMap, format: MapFormat) -> String {
         MapFormat::Csv => csv(points, map.word_order()),
         MapFormat::Json => json(map),
         MapFormat::Md => markdown(points, map),
+        MapFormat::St => structured_text(map),
     }
 }
 

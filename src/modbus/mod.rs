@@ -4,7 +4,7 @@
 //! - [`settings`]: the `[modbus]` table of the configuration.
 //! - [`node_block`], [`gateway_block`], [`event_ring`]: the fixed blocks, each with what its registers mean.
 //! - [`register_map`]: which unit and address shows what; built once from the tag table, immutable.
-//!   [`map_text`] writes it for people and programs; `map diff`.
+//!   [`map_text`] writes it for people and programs, [`map_st`] for PLC projects; `map diff`.
 //!   [`address_space`] is the part that is the same for registers and bits, [`points`] the list for people.
 //! - [`register_bank`]: reads registers out of the process image. [`encoding`]: values as registers.
 //!
@@ -25,6 +25,7 @@ pub mod frame;
 pub mod gateway_block;
 pub mod heartbeat;
 pub mod identification;
+pub mod map_st;
 pub mod map_text;
 pub mod node_block;
 pub mod pdu;

@@ -1,6 +1,7 @@
 //! What the registers and bits show.
 
 use cangate::mapping::{OnLoss, TagTable};
+use cangate::modbus::map_text::{MapFormat, render};
 use cangate::modbus::{ModbusSettings, RegisterBank, RegisterMap, WordOrder};
 use cangate::process_image::{
     AlarmIndex, AlarmState, BusState, Event, EventKind, NmtState, NodeCounters, Priority, ProcessImage,
@@ -494,4 +495,35 @@ fn every_point_of_the_map_can_be_read_and_every_entry_has_its_point() {
             assert_eq!(map.points().iter().filter(covers).count(), 1, "unit {unit_id} {table} {address}");
         }
     }
+}
+
+#[test]
+fn the_structured_text_has_a_constant_for_every_point() {
+    let mut table = table();
+    table.nodes[0].name = "1-pump".into();
+    table.tags[0].description = "ends here *) or\nthere".into();
+    let map = RegisterMap::build(&table, &ModbusSettings::default(), "cangate").unwrap();
+    let text = render(&map, MapFormat::St);
+    let declared: Vec<(&str, &str)> = text
+        .lines()
+        .filter_map(|line| line.trim().split_once(" : "))
+        .filter(|(_, rest)| rest.contains(":="))
+        .collect();
+    let names: std::collections::BTreeSet<&str> = declared.iter().map(|(name, _)| *name).collect();
+    assert_eq!(names.len(), declared.len(), "each name once");
+    let addresses = declared.iter().filter_map(|(_, rest)| rest.strip_prefix("UINT := ")?.split(';').next());
+    let expected: Vec<String> = map.points().iter().map(|point| point.address.to_string()).collect();
+    assert_eq!(addresses.collect::<Vec<_>>(), expected);
+    let pattern =
+        "    CANGATE_TEST_U32_U32 : UINT := 91; (* input register: Always 0x12345678 = 305419896 *)";
+    assert!(text.lines().any(|line| line == pattern), "{text}");
+    assert!(text.contains("    N_1_PUMP_UNIT_ID : BYTE := 1;"));
+    let hash = format!("16#{}", map.hash_text()[..8].to_uppercase());
+    assert!(text.contains(&hash));
+    assert_eq!(
+        text.matches("(*").count(),
+        text.matches("*)").count(),
+        "no description ends its comment early"
+    );
+    assert_eq!(text.lines().filter(|line| line.contains("(*") && !line.ends_with("*)")).count(), 0);
 }
