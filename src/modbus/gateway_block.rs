@@ -20,7 +20,7 @@ pub const MAP_VERSION: u16 = 1;
 /// What a register of the gateway shows.
 #[derive(Clone, Copy, Debug)]
 pub enum GatewayRegister {
-    /// +1 per second.
+    /// +1 per second while the core runs.
     Heartbeat,
     /// Bits 0-5.
     StatusWord,
@@ -89,7 +89,13 @@ const fn pattern(
 
 /// The fixed part, buses apart. What it leaves out is reserved and reads 0.
 pub const GATEWAY_BLOCK: &[Row<GatewayRegister>] = &[
-    row(0, "gateway.heartbeat", "", GatewayRegister::Heartbeat, "Counts up by one per second"),
+    row(
+        0,
+        "gateway.heartbeat",
+        "",
+        GatewayRegister::Heartbeat,
+        "Counts up by one per second while the core of the gateway runs",
+    ),
     row(
         1,
         "gateway.status",

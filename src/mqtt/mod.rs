@@ -3,6 +3,7 @@
 //! - [`settings`]: the `[mqtt]` table.
 //! - [`topics`], [`payload`], [`json`]: names and contents, pure.
 //! - [`publisher`]: what has to be published when, pure. [`outbox`]: what the broker has not acknowledged yet.
+//! - `told`: what the broker was told last, pure.
 //! - [`back_off`]: how long to wait for the next attempt, pure.
 //! - [`uplink`] \[IO\]: one session with a broker. [`client`] \[IO\]: the task that keeps one.
 //! - `broker` \[IO\]: a broker inside the process, for the demo.
@@ -16,6 +17,7 @@ pub mod outbox;
 pub mod payload;
 pub mod publisher;
 pub mod settings;
+mod told;
 pub mod topics;
 pub mod uplink;
 

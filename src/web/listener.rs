@@ -171,7 +171,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
             self.moved();
             self.asked();
         }
-        // Also when there was something to read: who sends a byte now and then gets no longer for it.
+        // Also when there was something to read: a sender that never pauses gets no longer for it.
         if self.is_over(context) { over() } else { polled }
     }
 }
@@ -214,9 +214,12 @@ mod tests {
         (Connection::new(near, place, clock), far, places, clock)
     }
 
-    /// Writes a byte every so often until nobody reads any more.
+    /// Writes a byte every so often for two minutes, if anybody reads that long.
     async fn dribble(mut far: DuplexStream, pause: Duration) {
-        while far.write_all(b"x").await.is_ok() {
+        for _ in 0..120 {
+            if far.write_all(b"x").await.is_err() {
+                return;
+            }
             tokio::time::sleep(pause).await;
         }
     }
