@@ -21,11 +21,6 @@ pub(super) fn spec() -> Builder {
 pub(super) struct Builder(AlarmSpec);
 
 impl Builder {
-    pub(super) fn priority(mut self, priority: Priority) -> Self {
-        self.0.priority = priority;
-        self
-    }
-
     /// In milliseconds.
     pub(super) fn delays(mut self, on: u64, off: u64) -> Self {
         self.0.on_delay = Duration::from_millis(on);

@@ -11,11 +11,15 @@ use std::time::Duration;
 use super::AlarmSpec;
 use super::state::{AlarmEvent, AlarmMachine};
 use super::suppression::Suppression;
-use crate::process_image::{AlarmIndex, AlarmState, AlarmStatus, Priority, Value};
+use crate::process_image::{AlarmIndex, AlarmState, AlarmStatus, Value};
 use crate::time::{Instant, Now};
 
-/// Longest time for which an alarm can be shelved: shelving always ends.
-pub const LONGEST_SHELVING: Duration = Duration::from_secs(24 * 3600);
+/// An alarm that is raised [`CHATTER_RAISES`] times within this time chatters: from then on its condition must be gone so
+/// long before it returns.
+const CHATTER: Duration = Duration::from_secs(60);
+
+/// See [`CHATTER`].
+const CHATTER_RAISES: usize = 3;
 
 /// An alarm changed its state.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -44,17 +48,6 @@ pub enum AcknowledgeError {
     NothingToAcknowledge,
 }
 
-/// How many alarms are in need of attention.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct AlarmCounts {
-    /// Active, latched ones included.
-    pub active: usize,
-    /// Waiting for an acknowledgement.
-    pub unacknowledged: usize,
-    /// Highest priority of an active one.
-    pub highest: Option<Priority>,
-}
-
 /// All alarms of the gateway.
 #[derive(Debug)]
 pub struct AlarmList {
@@ -76,8 +69,8 @@ struct Alarm {
     holds: bool,
     /// The delay that runs.
     delay: Option<Timer>,
-    /// The end of shelving.
-    shelving: Option<Timer>,
+    /// When it was raised the last times before it was quiet for long, the oldest first.
+    raised_at: [Option<Instant>; CHATTER_RAISES],
     /// Causes that are active.
     causes: usize,
     /// Value told with the condition.
@@ -106,7 +99,6 @@ struct Timer {
 enum Expiry {
     On { rank: usize },
     Off { rank: Reverse<usize> },
-    Shelving,
 }
 
 impl AlarmList {
@@ -155,9 +147,10 @@ impl AlarmList {
         alarm.delay = None;
         if alarm.holds != holds {
             let (delay, what) = if holds {
+                alarm.value = value;
                 (alarm.spec.on_delay, Expiry::On { rank })
             } else {
-                (alarm.spec.off_delay, Expiry::Off { rank: Reverse(rank) })
+                (alarm.off_delay(), Expiry::Off { rank: Reverse(rank) })
             };
             let timer = Timer { at: now.instant + delay, what, alarm: place };
             alarm.delay = Some(timer);
@@ -188,44 +181,6 @@ impl AlarmList {
         self.apply(now, alarm.0, AlarmEvent::Reset)
     }
 
-    /// An operator puts an alarm aside for a time, at most [`LONGEST_SHELVING`]; the end of one that is shelved already is
-    /// set anew. `false`: there is no such alarm, or it is out of service.
-    pub fn shelve(&mut self, now: Now, alarm: AlarmIndex, time: Duration) -> bool {
-        self.handle_timeout(now);
-        let place = alarm.0;
-        let known = self.alarms.get(place);
-        if known.is_none_or(|alarm| alarm.status.state == AlarmState::OutOfService) {
-            return false;
-        }
-        self.apply(now, place, AlarmEvent::Shelve);
-        let at = now.instant + time.min(LONGEST_SHELVING);
-        let timer = Timer { at, what: Expiry::Shelving, alarm: place };
-        if let Some(alarm) = self.alarms.get_mut(place) {
-            if let Some(old) = alarm.shelving.replace(timer) {
-                self.timers.remove(&old);
-            }
-            self.timers.insert(timer);
-        }
-        true
-    }
-
-    /// An operator takes a shelved alarm back. `false` where it is not shelved.
-    pub fn unshelve(&mut self, now: Now, alarm: AlarmIndex) -> bool {
-        self.handle_timeout(now);
-        let timer = self.alarms.get_mut(alarm.0).and_then(|alarm| alarm.shelving.take());
-        if let Some(timer) = timer {
-            self.timers.remove(&timer);
-        }
-        self.apply(now, alarm.0, AlarmEvent::Unshelve)
-    }
-
-    /// Takes an alarm out of service, or back. `false` where it is so already, or there is no such alarm.
-    pub fn set_out_of_service(&mut self, now: Now, alarm: AlarmIndex, out: bool) -> bool {
-        self.handle_timeout(now);
-        let event = if out { AlarmEvent::TakeOutOfService } else { AlarmEvent::ReturnToService };
-        self.apply(now, alarm.0, event)
-    }
-
     /// Delays that ran out.
     pub fn handle_timeout(&mut self, now: Now) {
         self.observe(now);
@@ -252,20 +207,6 @@ impl AlarmList {
         self.alarms.get(alarm.0).map(|alarm| &alarm.status)
     }
 
-    /// How many of these alarms are in need of attention.
-    #[must_use]
-    pub fn counts(&self, alarms: impl IntoIterator<Item = AlarmIndex>) -> AlarmCounts {
-        let mut counts = AlarmCounts::default();
-        for alarm in alarms.into_iter().filter_map(|alarm| self.alarms.get(alarm.0)) {
-            if alarm.status.state.is_active() {
-                counts.active += 1;
-                counts.highest = counts.highest.max(Some(alarm.spec.priority));
-            }
-            counts.unacknowledged += usize::from(alarm.status.state.is_unacknowledged());
-        }
-        counts
-    }
-
     fn observe(&mut self, now: Now) {
         if now.instant >= self.now.instant {
             self.now = now;
@@ -280,11 +221,8 @@ impl AlarmList {
             let event = match timer.what {
                 Expiry::On { .. } => AlarmEvent::On,
                 Expiry::Off { .. } => AlarmEvent::Off,
-                Expiry::Shelving => AlarmEvent::Unshelve,
             };
-            if event == AlarmEvent::Unshelve {
-                alarm.shelving = None;
-            } else if alarm.delay == Some(timer) {
+            if alarm.delay == Some(timer) {
                 alarm.delay = None;
                 alarm.holds = timer.leads_to();
             }
@@ -307,6 +245,17 @@ impl AlarmList {
         let is_cause = alarm.machine.suppresses_others();
         if event == AlarmEvent::On && accepted {
             alarm.status.count = alarm.status.count.saturating_add(1);
+            alarm.note_raise(at.instant);
+            if let Some(timer) = alarm.delay.filter(|timer| alarm.chatters() && !timer.leads_to()) {
+                // The condition has ended already, before it was known that the alarm chatters.
+                let later =
+                    Timer { at: timer.at + alarm.off_delay().saturating_sub(alarm.spec.off_delay), ..timer };
+                alarm.delay = Some(later);
+                self.timers.remove(&timer);
+                self.timers.insert(later);
+            }
+        } else if event == AlarmEvent::Off && accepted && alarm.chatters() {
+            alarm.raised_at = [None; CHATTER_RAISES];
         }
         self.show(at, place);
         if is_cause != was_cause {
@@ -390,10 +339,30 @@ impl Alarm {
             status: AlarmStatus::default(),
             holds: false,
             delay: None,
-            shelving: None,
+            raised_at: [None; CHATTER_RAISES],
             causes: 0,
             value: None,
         }
+    }
+
+    fn note_raise(&mut self, at: Instant) {
+        self.raised_at.rotate_left(1);
+        if let Some(newest) = self.raised_at.last_mut() {
+            *newest = Some(at);
+        }
+    }
+
+    /// It was raised so often lately that it is held until it is quiet for long.
+    fn chatters(&self) -> bool {
+        match (self.raised_at.first(), self.raised_at.last()) {
+            (Some(Some(oldest)), Some(Some(newest))) => newest.since(*oldest) <= CHATTER,
+            _ => false,
+        }
+    }
+
+    /// How long the condition must be gone before it returns.
+    fn off_delay(&self) -> Duration {
+        if self.chatters() { self.spec.off_delay.max(CHATTER) } else { self.spec.off_delay }
     }
 }
 

@@ -6,14 +6,14 @@
 //! - [`spec`]: what each alarm is like.
 //! - [`state`]: the state machine of one alarm.
 //! - `suppression`: which alarm tells the cause of which.
-//! - [`list`]: all alarms; delays, shelving, suppression, first-out.
+//! - [`list`]: all alarms; delays, chatter, suppression, first-out.
 
 pub mod list;
 pub mod spec;
 pub mod state;
 mod suppression;
 
-pub use list::{AcknowledgeError, AlarmCounts, AlarmList, LONGEST_SHELVING, Transition};
+pub use list::{AcknowledgeError, AlarmList, Transition};
 pub use spec::AlarmSpec;
 pub use state::{AlarmEvent, AlarmMachine};
 

@@ -16,7 +16,7 @@ pub struct AlarmSpec {
     /// Stays active after its condition has gone, until it is acknowledged and then reset.
     pub latch: bool,
     /// Alarms that tell the cause: while the condition of one of them holds (its delays included) this one is
-    /// suppressed, shelved or suppressed itself as that one may be. One that is out of service suppresses nothing.
+    /// suppressed, acknowledged or suppressed itself as that one may be.
     pub suppressed_by: Vec<AlarmIndex>,
     /// First-out group: the first alarm of a group to be raised since none of it was active is marked.
     pub first_out_group: Option<u32>,

@@ -1,13 +1,14 @@
 //! The state machine of one alarm (ISA-18.2, IEC 62682).
 //!
 //! Underneath is what an operator has to deal with: one of the six states from normal to latched acknowledged. Over it
-//! lie three reasons to keep quiet: out of service, shelved, suppressed, the first that applies being shown. An alarm
-//! that is kept quiet still follows its condition, but is not raised. When nothing keeps it quiet any more it is raised
-//! at once if its condition holds; if not, it shows what it remembers from before: an alarm that nobody acknowledged
-//! still waits for that, a latched one for its reset.
+//! lies a reason to keep quiet: suppressed. An alarm that is kept quiet still follows its condition, but is not raised.
+//! When nothing keeps it quiet any more it is raised at once if its condition holds; if not, it shows what it remembers
+//! from before: an alarm that nobody acknowledged still waits for that, a latched one for its reset.
 //!
 //! Suppression shows only where there is something to suppress: a normal alarm whose cause is active stays normal, so
 //! that one cause does not move every alarm of a plant.
+//!
+//! The standard's other reasons, shelving and taking out of service, are an operator's; nothing asks for them here.
 
 use crate::process_image::AlarmState;
 
@@ -22,34 +23,16 @@ pub enum AlarmEvent {
     Acknowledge,
     /// An operator resets it after the cause was mended.
     Reset,
-    /// An operator puts it aside for a time.
-    Shelve,
-    /// That time is over, or the operator takes it back.
-    Unshelve,
     /// Another alarm tells the cause.
     Suppress,
     /// The cause has gone.
     Unsuppress,
-    /// Taken out of service for maintenance.
-    TakeOutOfService,
-    /// Back in service.
-    ReturnToService,
 }
 
 impl AlarmEvent {
     /// All of them.
-    pub const ALL: [Self; 10] = [
-        Self::On,
-        Self::Off,
-        Self::Acknowledge,
-        Self::Reset,
-        Self::Shelve,
-        Self::Unshelve,
-        Self::Suppress,
-        Self::Unsuppress,
-        Self::TakeOutOfService,
-        Self::ReturnToService,
-    ];
+    pub const ALL: [Self; 6] =
+        [Self::On, Self::Off, Self::Acknowledge, Self::Reset, Self::Suppress, Self::Unsuppress];
 }
 
 /// One alarm.
@@ -60,49 +43,29 @@ pub struct AlarmMachine {
     /// What would show if nothing kept it quiet: normal to latched acknowledged.
     annunciated: AlarmState,
     suppressed: bool,
-    shelved: bool,
-    out_of_service: bool,
 }
 
 impl AlarmMachine {
     /// Normal. `latch`: stays active after its condition has gone, until it is acknowledged and then reset.
     #[must_use]
     pub const fn new(latch: bool) -> Self {
-        Self {
-            latch,
-            holds: false,
-            annunciated: AlarmState::Normal,
-            suppressed: false,
-            shelved: false,
-            out_of_service: false,
-        }
+        Self { latch, holds: false, annunciated: AlarmState::Normal, suppressed: false }
     }
 
     /// The state that shows.
     #[must_use]
     pub fn state(&self) -> AlarmState {
-        if self.out_of_service {
-            AlarmState::OutOfService
-        } else if self.shelved {
-            AlarmState::Shelved
-        } else if self.suppressed && (self.holds || self.annunciated != AlarmState::Normal) {
+        if self.suppressed && (self.holds || self.annunciated != AlarmState::Normal) {
             AlarmState::Suppressed
         } else {
             self.annunciated
         }
     }
 
-    /// Whether the condition holds, delays included, kept quiet or not.
-    #[must_use]
-    pub fn holds(&self) -> bool {
-        self.holds
-    }
-
-    /// Whether it tells the cause of others: its condition holds, and it is in service. A shelved alarm does: who put it
-    /// aside knows of the cause.
+    /// Whether it tells the cause of others: its condition holds, delays included, whatever an operator did about it.
     #[must_use]
     pub fn suppresses_others(&self) -> bool {
-        self.holds && !self.out_of_service
+        self.holds
     }
 
     /// Takes an event. `false`: it means nothing in this state, as an acknowledgement where nothing waits for one.
@@ -124,50 +87,31 @@ impl AlarmMachine {
             }
             AlarmEvent::Acknowledge => self.answer(acknowledged),
             AlarmEvent::Reset => self.answer(reset),
-            AlarmEvent::Shelve => !self.out_of_service && !std::mem::replace(&mut self.shelved, true),
             AlarmEvent::Suppress => !std::mem::replace(&mut self.suppressed, true),
-            AlarmEvent::TakeOutOfService => !std::mem::replace(&mut self.out_of_service, true),
-            AlarmEvent::Unshelve => {
-                let shelved = std::mem::take(&mut self.shelved);
-                self.return_after(shelved)
-            }
             AlarmEvent::Unsuppress => {
                 let suppressed = std::mem::take(&mut self.suppressed);
-                self.return_after(suppressed)
-            }
-            AlarmEvent::ReturnToService => {
-                let out_of_service = std::mem::take(&mut self.out_of_service);
-                self.return_after(out_of_service)
+                if suppressed && self.holds {
+                    // Also if it was acknowledged before: what happened meanwhile nobody was told.
+                    self.raise();
+                }
+                suppressed
             }
         }
     }
 
-    fn is_quiet(self) -> bool {
-        self.out_of_service || self.shelved || self.suppressed
-    }
-
     fn raise(&mut self) {
-        if !self.is_quiet() {
+        if !self.suppressed {
             self.annunciated = AlarmState::Unacknowledged;
         }
     }
 
     /// An operator's answer counts only for what the operator can see.
     fn answer(&mut self, step: fn(AlarmState) -> Option<AlarmState>) -> bool {
-        let next = step(self.annunciated).filter(|_| !self.is_quiet());
+        let next = step(self.annunciated).filter(|_| !self.suppressed);
         if let Some(next) = next {
             self.annunciated = next;
         }
         next.is_some()
-    }
-
-    /// A reason to keep quiet has gone. What holds is raised, also if it was acknowledged before: what happened meanwhile
-    /// nobody was told.
-    fn return_after(&mut self, was_quiet: bool) -> bool {
-        if was_quiet && self.holds {
-            self.raise();
-        }
-        was_quiet
     }
 }
 
@@ -214,7 +158,7 @@ mod tests {
 
     use AlarmState::{
         Acknowledged as C, LatchedAcknowledged as F, LatchedUnacknowledged as E, Normal as A,
-        OutOfService as I, ReturnedUnacknowledged as D, Shelved as G, Suppressed as H, Unacknowledged as B,
+        ReturnedUnacknowledged as D, Suppressed as H, Unacknowledged as B,
     };
 
     fn machine(latch: bool, events: &[AlarmEvent]) -> AlarmMachine {
@@ -225,9 +169,9 @@ mod tests {
         machine
     }
 
-    /// A machine in each state; those that keep an alarm quiet with a condition that holds.
-    fn in_each_state() -> [(AlarmState, AlarmMachine); 9] {
-        use AlarmEvent::{Acknowledge, Off, On, Shelve, Suppress, TakeOutOfService};
+    /// A machine in each state; the suppressed one with a condition that holds.
+    fn in_each_state() -> [(AlarmState, AlarmMachine); 7] {
+        use AlarmEvent::{Acknowledge, Off, On, Suppress};
         [
             (A, machine(false, &[])),
             (B, machine(false, &[On])),
@@ -235,25 +179,21 @@ mod tests {
             (D, machine(false, &[On, Off])),
             (E, machine(true, &[On, Off])),
             (F, machine(true, &[On, Off, Acknowledge])),
-            (G, machine(false, &[On, Shelve])),
             (H, machine(false, &[On, Suppress])),
-            (I, machine(false, &[On, TakeOutOfService])),
         ]
     }
 
     #[test]
-    fn all_90_pairs_of_state_and_event() {
-        // on, off, acknowledge, reset, shelve, unshelve, suppress, unsuppress, take out of service, return to service
+    fn all_42_pairs_of_state_and_event() {
+        // on, off, acknowledge, reset, suppress, unsuppress
         let table = [
-            (A, [B, A, A, A, G, A, A, A, I, A]),
-            (B, [B, D, C, B, G, B, H, B, I, B]),
-            (C, [C, A, C, C, G, C, H, C, I, C]),
-            (D, [B, D, A, D, G, D, H, D, I, D]),
-            (E, [B, E, F, E, G, E, H, E, I, E]),
-            (F, [B, F, F, A, G, F, H, F, I, F]),
-            (G, [G, G, G, G, G, B, G, G, I, G]),
-            (H, [H, H, H, H, G, H, H, B, I, H]),
-            (I, [I, I, I, I, I, I, I, I, I, B]),
+            (A, [B, A, A, A, A, A]),
+            (B, [B, D, C, B, H, B]),
+            (C, [C, A, C, C, H, C]),
+            (D, [B, D, A, D, H, D]),
+            (E, [B, E, F, E, H, E]),
+            (F, [B, F, F, A, H, F]),
+            (H, [H, H, H, H, H, B]),
         ];
         for ((state, machine), (expected_state, row)) in in_each_state().into_iter().zip(table) {
             assert_eq!((machine.state(), state), (expected_state, expected_state));
@@ -289,16 +229,10 @@ mod tests {
     }
 
     #[test]
-    fn what_came_and_went_while_it_was_kept_quiet_leaves_nothing() {
-        use AlarmEvent::{
-            Off, On, ReturnToService, Shelve, Suppress, TakeOutOfService, Unshelve, Unsuppress,
-        };
+    fn what_came_and_went_while_it_was_suppressed_leaves_nothing() {
+        use AlarmEvent::{Off, On, Suppress, Unsuppress};
         for latch in [false, true] {
-            for (quiet, back) in
-                [(Suppress, Unsuppress), (Shelve, Unshelve), (TakeOutOfService, ReturnToService)]
-            {
-                assert_eq!(machine(latch, &[quiet, On, Off, back]).state(), A, "{quiet:?}");
-            }
+            assert_eq!(machine(latch, &[Suppress, On, Off, Unsuppress]).state(), A);
         }
     }
 
@@ -325,22 +259,5 @@ mod tests {
         use AlarmEvent::{Off, On, Suppress};
         assert_eq!(machine(false, &[Suppress]).state(), A);
         assert_eq!(machine(false, &[Suppress, On, Off]).state(), A);
-    }
-
-    #[test]
-    fn of_several_reasons_to_keep_quiet_each_has_to_go() {
-        use AlarmEvent::{On, ReturnToService, Shelve, Suppress, TakeOutOfService, Unshelve, Unsuppress};
-        let mut machine = machine(false, &[On, Shelve, Suppress, TakeOutOfService]);
-        for (event, expected) in [(Unshelve, I), (ReturnToService, H), (Unsuppress, B)] {
-            assert!(machine.handle(event));
-            assert_eq!(machine.state(), expected);
-        }
-    }
-
-    #[test]
-    fn an_alarm_out_of_service_tells_no_cause() {
-        use AlarmEvent::{On, Shelve, TakeOutOfService};
-        assert!(machine(false, &[On, Shelve]).suppresses_others());
-        assert!(!machine(false, &[On, TakeOutOfService]).suppresses_others());
     }
 }

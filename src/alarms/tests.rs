@@ -1,12 +1,10 @@
-//! Tests of the alarm list: delays, suppression, first-out, shelving; and a model to compare it with.
-
-use std::time::Duration;
+//! Tests of the alarm list: delays, chatter, suppression, first-out; and a model to compare it with.
 
 use proptest::prelude::*;
 
 use super::fixture::{Builder, spec};
-use super::{AcknowledgeError, AlarmCounts, AlarmList, LONGEST_SHELVING};
-use crate::process_image::{AlarmIndex, AlarmState, Priority, Value};
+use super::{AcknowledgeError, AlarmList};
+use crate::process_image::{AlarmIndex, AlarmState, Value};
 use crate::time::Now;
 
 fn list<const N: usize>(specs: [Builder; N]) -> AlarmList {
@@ -128,6 +126,57 @@ fn the_value_that_raised_an_alarm_stays_with_it() {
     assert_eq!(list.status(AlarmIndex(0)).unwrap().value, Some(Value::Unsigned(2)));
 }
 
+#[test]
+fn an_alarm_that_is_raised_without_a_value_shows_none_of_the_time_before() {
+    let mut list = list([spec()]);
+    list.set_condition(at(0), AlarmIndex(0), true, Some(Value::Unsigned(1)));
+    run(&mut list, 0);
+    set(&mut list, 100, 0, false);
+    set(&mut list, 200, 0, true);
+    run(&mut list, 200);
+    assert_eq!(list.status(AlarmIndex(0)).unwrap().value, None);
+}
+
+#[test]
+fn an_alarm_that_chatters_is_held_until_it_is_quiet_for_a_minute() {
+    let mut list = list([spec().delays(0, 500)]);
+    for raise in 0..3 {
+        set(&mut list, 10_000 * raise, 0, true);
+        set(&mut list, 10_000 * raise + 1_000, 0, false);
+    }
+    let raised = run(&mut list, 79_000);
+    assert_eq!(raised, ["0 0 A>B", "1500 0 B>D", "10000 0 D>B", "11500 0 B>D", "20000 0 D>B"]);
+    set(&mut list, 79_500, 0, true);
+    set(&mut list, 80_000, 0, false);
+    assert_eq!(run(&mut list, 150_000), ["140000 0 B>D"], "a minute after the last");
+    set(&mut list, 150_000, 0, true);
+    set(&mut list, 151_000, 0, false);
+    assert_eq!(run(&mut list, 200_000), ["150000 0 D>B", "151500 0 B>D"], "then as ever");
+}
+
+#[test]
+fn an_alarm_that_is_raised_twice_in_a_minute_or_three_times_in_more_does_not_chatter() {
+    let mut list = list([spec().delays(0, 500)]);
+    let mut count = 0;
+    for raise in 0..20 {
+        set(&mut list, 31_000 * raise, 0, true);
+        set(&mut list, 31_000 * raise + 1_000, 0, false);
+        count += run(&mut list, 31_000 * raise + 2_000).len();
+    }
+    assert_eq!(count, 40);
+}
+
+#[test]
+fn the_third_pulse_of_no_length_within_a_minute_is_held_too() {
+    let mut list = list([spec()]);
+    for pulse in 0..3 {
+        set(&mut list, 1_000 * pulse, 0, true);
+        set(&mut list, 1_000 * pulse, 0, false);
+    }
+    let held = ["0 0 A>B", "0 0 B>D", "1000 0 D>B", "1000 0 B>D", "2000 0 D>B", "62000 0 B>D"];
+    assert_eq!(run(&mut list, 100_000), held);
+}
+
 /// A bus, a node on it, a TPDO of the node.
 fn chain() -> AlarmList {
     list([spec(), spec().suppressed_by(&[0]), spec().suppressed_by(&[0, 1])])
@@ -187,49 +236,11 @@ fn a_suppressed_alarm_counts() {
     let mut list = chain();
     set(&mut list, 0, 0, true);
     for pulse in 1..=3 {
-        set(&mut list, 10 * pulse, 1, true);
-        set(&mut list, 10 * pulse + 5, 1, false);
+        set(&mut list, 100_000 * pulse, 1, true);
+        set(&mut list, 100_000 * pulse + 5, 1, false);
     }
     assert_eq!(changes(&mut list).len(), 7);
     assert_eq!(list.status(AlarmIndex(1)).unwrap().count, 3);
-}
-
-#[test]
-fn a_cause_out_of_service_suppresses_nothing_and_a_shelved_one_does() {
-    let mut list = chain();
-    set(&mut list, 0, 0, true);
-    set(&mut list, 0, 1, true);
-    assert_eq!(changes(&mut list), ["0 0 A>B", "0 1 A>H"]);
-    assert!(list.shelve(at(1), AlarmIndex(0), Duration::from_secs(1)));
-    assert_eq!(changes(&mut list), ["1 0 B>G"]);
-    assert!(list.set_out_of_service(at(2), AlarmIndex(0), true));
-    assert!(!list.set_out_of_service(at(2), AlarmIndex(0), true));
-    assert_eq!(changes(&mut list), ["2 0 G>I", "2 1 H>B"]);
-    assert!(!list.shelve(at(2), AlarmIndex(0), Duration::from_secs(9)));
-    assert!(list.set_out_of_service(at(2000), AlarmIndex(0), false));
-    assert_eq!(changes(&mut list), ["2000 0 I>B", "2000 1 B>H"]);
-}
-
-#[test]
-fn shelving_always_ends() {
-    let mut list = list([spec(), spec()]);
-    set(&mut list, 0, 0, true);
-    assert!(list.shelve(at(10), AlarmIndex(0), Duration::from_secs(60)));
-    assert!(list.shelve(at(20), AlarmIndex(0), Duration::from_secs(1)), "a new end");
-    assert!(list.shelve(at(20), AlarmIndex(1), Duration::MAX));
-    assert!(!list.shelve(at(20), AlarmIndex(2), Duration::from_secs(1)));
-    assert_eq!(run(&mut list, 2000), ["0 0 A>B", "10 0 B>G", "20 1 A>G", "1020 0 G>B"]);
-    let longest = u64::try_from(LONGEST_SHELVING.as_millis()).unwrap();
-    assert_eq!(run(&mut list, 20 + longest), [format!("{} 1 G>A", 20 + longest)]);
-}
-
-#[test]
-fn an_operator_can_take_a_shelved_alarm_back() {
-    let mut list = list([spec()]);
-    assert!(!list.unshelve(at(0), AlarmIndex(0)));
-    assert!(list.shelve(at(0), AlarmIndex(0), Duration::from_secs(1)));
-    assert!(list.unshelve(at(10), AlarmIndex(0)));
-    assert_eq!(run(&mut list, 5000), ["0 0 A>G", "10 0 G>A"]);
 }
 
 #[test]
@@ -260,37 +271,15 @@ fn a_latched_alarm_keeps_its_group_from_being_quiet() {
 }
 
 #[test]
-fn counts_tell_what_needs_attention() {
-    let mut list = list([
-        spec().priority(Priority::High),
-        spec().priority(Priority::Critical).latch(true),
-        spec().priority(Priority::Low),
-    ]);
-    assert_eq!(list.counts((0..3).map(AlarmIndex)), AlarmCounts::default());
-    set(&mut list, 0, 0, true);
-    set(&mut list, 0, 1, true);
-    set(&mut list, 0, 2, true);
-    set(&mut list, 1, 1, false);
-    set(&mut list, 1, 2, false);
-    list.acknowledge(at(1), AlarmIndex(0)).unwrap();
-    let counts = |list: &AlarmList, range: std::ops::Range<usize>| list.counts(range.map(AlarmIndex));
-    assert_eq!(
-        counts(&list, 0..9),
-        AlarmCounts { active: 2, unacknowledged: 2, highest: Some(Priority::Critical) }
-    );
-    assert_eq!(counts(&list, 2..3), AlarmCounts { active: 0, unacknowledged: 1, highest: None });
-}
-
-#[test]
 fn transitions_that_nobody_fetches_are_bounded() {
     let mut list = list([spec()]);
-    for millis in 0..1000 {
-        set(&mut list, millis, 0, millis % 2 == 0);
-        list.handle_timeout(at(millis));
+    for minute in 0..1000 {
+        set(&mut list, 60_000 * minute, 0, minute % 2 == 0);
+        list.handle_timeout(at(60_000 * minute));
     }
     let left = changes(&mut list);
     assert_eq!(left.len(), 8);
-    assert_eq!(left.last().unwrap(), "999 0 B>D");
+    assert_eq!(left.last().unwrap(), "59940000 0 B>D");
 }
 
 #[test]
@@ -308,9 +297,6 @@ enum Act {
     Condition(usize, bool),
     Acknowledge(usize),
     Reset(usize),
-    Shelve(usize, u64),
-    Unshelve(usize),
-    Service(usize, bool),
 }
 
 fn any_act() -> impl Strategy<Value = Act> {
@@ -318,15 +304,17 @@ fn any_act() -> impl Strategy<Value = Act> {
     prop_oneof![
         8 => (alarm.clone(), any::<bool>()).prop_map(|(alarm, holds)| Act::Condition(alarm, holds)),
         2 => alarm.clone().prop_map(Act::Acknowledge),
-        1 => alarm.clone().prop_map(Act::Reset),
-        1 => (alarm.clone(), 1_u64..20).prop_map(|(alarm, time)| Act::Shelve(alarm, time)),
-        1 => alarm.clone().prop_map(Act::Unshelve),
-        1 => (alarm, any::<bool>()).prop_map(|(alarm, out)| Act::Service(alarm, out)),
+        1 => alarm.prop_map(Act::Reset),
     ]
 }
 
-/// One alarm as a naive reader of the rules would write it: looked at once in every millisecond.
-#[derive(Clone, Copy, Debug, Default)]
+/// The model's unit of time, in ms: so long that a minute is a few of them, and alarms can chatter and be quiet again.
+const TICK: u64 = 10_000;
+/// A minute.
+const CHATTER: u64 = 6;
+
+/// One alarm as a naive reader of the rules would write it: looked at once in every tick.
+#[derive(Clone, Debug, Default)]
 struct Model {
     on_delay: u64,
     off_delay: u64,
@@ -337,36 +325,40 @@ struct Model {
     active: bool,
     acknowledged: bool,
     latched: bool,
-    shelved_until: Option<u64>,
-    out: bool,
     suppressed: bool,
+    chatters: bool,
+    raises: Vec<u64>,
     ons: u64,
     offs: u64,
 }
 
 impl Model {
-    fn quiet(&self) -> bool {
-        self.out || self.shelved_until.is_some() || self.suppressed
-    }
-
     fn raise(&mut self) {
-        if !self.quiet() {
+        if !self.suppressed {
             (self.active, self.acknowledged, self.latched) = (true, false, false);
         }
     }
 
     /// Lets the condition take effect once its delay has passed.
     fn follow(&mut self, now: u64, to: bool) {
-        let delay = if to { self.on_delay } else { self.off_delay };
+        let held = if self.chatters { CHATTER } else { 0 };
+        let delay = if to { self.on_delay } else { self.off_delay.max(held) };
         if self.raw != to || self.live == to || now < self.raw_since + delay {
             return;
         }
         self.live = to;
         if to {
             self.ons += 1;
+            self.raises.push(now);
+            let lately = self.raises.iter().filter(|at| now - **at <= CHATTER).count();
+            self.chatters = lately >= 3;
             self.raise();
         } else {
             self.offs += 1;
+            if self.chatters {
+                self.raises.clear();
+            }
+            self.chatters = false;
             if self.active {
                 self.latched = self.latch;
                 self.active = false;
@@ -380,8 +372,6 @@ impl Model {
 
     fn state(&self) -> AlarmState {
         match (self.active, self.latched, self.acknowledged) {
-            _ if self.out => AlarmState::OutOfService,
-            _ if self.shelved_until.is_some() => AlarmState::Shelved,
             _ if self.suppressed && (self.live || !self.nothing_remembered()) => AlarmState::Suppressed,
             (true, _, false) => AlarmState::Unacknowledged,
             (true, _, true) => AlarmState::Acknowledged,
@@ -398,7 +388,7 @@ const CAUSES: [&[usize]; 3] = [&[], &[0], &[0, 1]];
 /// Suppression follows the causes; what comes free and holds is raised.
 fn suppress(models: &mut [Model; 3]) {
     for place in 0..3 {
-        let suppressed = CAUSES[place].iter().any(|cause| models[*cause].live && !models[*cause].out);
+        let suppressed = CAUSES[place].iter().any(|cause| models[*cause].live);
         let freed = models[place].suppressed && !suppressed;
         models[place].suppressed = suppressed;
         if freed && models[place].live {
@@ -416,14 +406,6 @@ fn settle(models: &mut [Model; 3], now: u64) {
         models[place].follow(now, false);
         suppress(models);
     }
-    for model in models {
-        if model.shelved_until.is_some_and(|until| until <= now) {
-            model.shelved_until = None;
-            if model.live {
-                model.raise();
-            }
-        }
-    }
 }
 
 fn act(models: &mut [Model; 3], now: u64, act: Act) {
@@ -436,31 +418,11 @@ fn act(models: &mut [Model; 3], now: u64, act: Act) {
         }
         Act::Acknowledge(place) => {
             let model = &mut models[place];
-            model.acknowledged |= !model.quiet();
+            model.acknowledged |= !model.suppressed;
         }
         Act::Reset(place) => {
             let model = &mut models[place];
-            model.latched &= model.active || model.quiet() || !model.acknowledged;
-        }
-        Act::Shelve(place, time) => {
-            let model = &mut models[place];
-            if !model.out {
-                model.shelved_until = Some(now + time);
-            }
-        }
-        Act::Unshelve(place) => {
-            let model = &mut models[place];
-            if model.shelved_until.take().is_some() && model.live {
-                model.raise();
-            }
-        }
-        Act::Service(place, out) => {
-            let back = models[place].out && !out;
-            models[place].out = out;
-            if back && models[place].live {
-                models[place].raise();
-            }
-            suppress(models);
+            model.latched &= model.active || model.suppressed || !model.acknowledged;
         }
     }
 }
@@ -470,41 +432,37 @@ proptest! {
 
     #[test]
     fn the_list_does_what_the_rules_say(
-        delays in prop::array::uniform3((0_u64..4, 0_u64..4, any::<bool>())),
+        delays in prop::array::uniform3((0_u64..4, 0_u64..9, any::<bool>())),
         acts in prop::collection::vec(prop::option::of(any_act()), 1..150),
     ) {
         let mut models = delays.map(|(on_delay, off_delay, latch)| {
             Model { on_delay, off_delay, latch, acknowledged: true, ..Model::default() }
         });
         let specs = delays.iter().zip(CAUSES).map(|(&(on, off, latch), causes)| {
-            spec().delays(on, off).latch(latch).suppressed_by(causes).build()
+            spec().delays(on * TICK, off * TICK).latch(latch).suppressed_by(causes).build()
         });
         let mut list = AlarmList::new(specs.collect());
         let mut shown = [AlarmState::Normal; 3];
-        for (now, step) in (0_u64..).zip(&acts) {
-            settle(&mut models, now);
-            list.handle_timeout(at(now));
+        for (tick, step) in (0_u64..).zip(&acts) {
+            let now = at(tick * TICK);
+            settle(&mut models, tick);
+            list.handle_timeout(now);
             if let Some(step) = step {
                 match *step {
-                    Act::Condition(alarm, holds) => set(&mut list, now, alarm, holds),
-                    Act::Acknowledge(alarm) => drop(list.acknowledge(at(now), AlarmIndex(alarm))),
-                    Act::Reset(alarm) => drop(list.reset(at(now), AlarmIndex(alarm))),
-                    Act::Shelve(alarm, time) => {
-                        list.shelve(at(now), AlarmIndex(alarm), Duration::from_millis(time));
-                    }
-                    Act::Unshelve(alarm) => drop(list.unshelve(at(now), AlarmIndex(alarm))),
-                    Act::Service(alarm, out) => drop(list.set_out_of_service(at(now), AlarmIndex(alarm), out)),
+                    Act::Condition(alarm, holds) => list.set_condition(now, AlarmIndex(alarm), holds, None),
+                    Act::Acknowledge(alarm) => drop(list.acknowledge(now, AlarmIndex(alarm))),
+                    Act::Reset(alarm) => drop(list.reset(now, AlarmIndex(alarm))),
                 }
-                act(&mut models, now, *step);
+                act(&mut models, tick, *step);
             }
-            settle(&mut models, now);
+            settle(&mut models, tick);
             while let Some(change) = list.poll_output() {
                 prop_assert_eq!(std::mem::replace(&mut shown[change.alarm.0], change.to), change.from);
                 prop_assert_ne!(change.from, change.to);
             }
             for (place, model) in models.iter().enumerate() {
                 let status = list.status(AlarmIndex(place)).unwrap();
-                prop_assert_eq!(status.state, model.state(), "alarm {} at {}", place, now);
+                prop_assert_eq!(status.state, model.state(), "alarm {} at {}", place, tick);
                 prop_assert_eq!(shown[place], status.state);
                 prop_assert_eq!(status.count, model.ons);
                 prop_assert!(model.ons - model.offs <= 1);
