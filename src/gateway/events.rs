@@ -7,7 +7,7 @@ use std::time::Duration;
 use crate::alarms::Transition;
 use crate::mapping::{AlarmOwner, TagTable};
 use crate::process_image::{Event, EventKind, TagIndex};
-use crate::time::{Instant, Now};
+use crate::time::{Instant, Now, Timestamp};
 
 /// Events of one kind about one node or bus that are journalled one by one within [`WINDOW`]; those above are folded.
 const BURST: u32 = 10;
@@ -44,6 +44,8 @@ struct Window {
     ends: Instant,
     passed: u32,
     folded: u64,
+    /// How the last folded one was: `from` and `to`.
+    last: (String, String),
     storming: bool,
 }
 
@@ -52,7 +54,8 @@ impl EventLog {
         Self { table, newest: 0, pending: Vec::new(), windows: BTreeMap::new(), next_flush: None }
     }
 
-    /// Something happened to a node, a bus or the gateway. `fill` completes the event, unless it is folded.
+    /// Something happened to a node, a bus or the gateway. `fill` completes the event; of those that are folded into a
+    /// count the last one's `from` and `to` are kept.
     pub(super) fn record(&mut self, now: Now, about: AlarmOwner, name: Name, fill: impl FnOnce(&mut Event)) {
         let key = (about, name);
         if self.windows.get(&key).is_some_and(|window| window.ends <= now.instant) {
@@ -62,10 +65,14 @@ impl EventLog {
             ends: now.instant + WINDOW,
             passed: 0,
             folded: 0,
+            last: Default::default(),
             storming: false,
         });
         if window.storming || window.passed >= BURST {
             window.folded = window.folded.saturating_add(1);
+            let mut event = blank();
+            fill(&mut event);
+            window.last = (event.from, event.to);
             let ends = window.ends;
             self.next_flush = Some(self.next_flush.map_or(ends, |flush| flush.min(ends)));
             return;
@@ -136,11 +143,14 @@ impl EventLog {
     fn close_window(&mut self, now: Now, key: Key) {
         let Some(window) = self.windows.get_mut(&key) else { return };
         let folded = std::mem::take(&mut window.folded);
+        let (from, to) = std::mem::take(&mut window.last);
         window.storming = folded > u64::from(BURST);
         window.passed = 0;
         window.ends = now.instant + WINDOW;
         if folded > 0 {
             self.push(now, key.0, key.1, |event| {
+                event.from = from;
+                event.to = to;
                 event.text = format!("{folded} more of these within {} s", WINDOW.as_secs());
             });
         }
@@ -161,20 +171,7 @@ impl EventLog {
             Name::Edge(tag) => self.table.tag(tag).map(|tag| tag.name.clone()).unwrap_or_default(),
         };
         self.newest += 1;
-        let mut event = Event {
-            seq: self.newest,
-            ts: now.utc,
-            kind,
-            node,
-            bus,
-            name,
-            from: String::new(),
-            to: String::new(),
-            alarm: None,
-            priority: None,
-            value: None,
-            text: String::new(),
-        };
+        let mut event = Event { seq: self.newest, ts: now.utc, kind, node, bus, name, ..blank() };
         fill(&mut event);
         tracing::info!(
             seq = event.seq,
@@ -187,6 +184,24 @@ impl EventLog {
             event.text
         );
         self.pending.push(event);
+    }
+}
+
+/// An event of which nothing is said yet.
+fn blank() -> Event {
+    Event {
+        seq: 0,
+        ts: Timestamp::default(),
+        kind: EventKind::Gateway,
+        node: None,
+        bus: None,
+        name: String::new(),
+        from: String::new(),
+        to: String::new(),
+        alarm: None,
+        priority: None,
+        value: None,
+        text: String::new(),
     }
 }
 
@@ -232,5 +247,19 @@ mod tests {
         let texts: Vec<String> = log.drain().map(|event| event.text).collect();
         assert_eq!(texts, ["1 more of these within 10 s", ""]);
         assert_eq!(log.poll_timeout(), None);
+    }
+    #[test]
+    fn a_count_tells_how_the_last_of_them_was() {
+        let mut log = EventLog::new(Arc::default());
+        for step in 0..30_u64 {
+            log.record(Now::from_millis(step), AlarmOwner::Gateway, Name::Word("storm"), |event| {
+                event.from = step.to_string();
+                event.to = (step + 1).to_string();
+            });
+        }
+        log.handle_timeout(Now::from_millis(10_000));
+        let last = log.drain().last().unwrap();
+        assert_eq!((last.from.as_str(), last.to.as_str()), ("29", "30"));
+        assert_eq!(last.text, "20 more of these within 10 s");
     }
 }
