@@ -6,6 +6,7 @@
 mod alarms;
 mod commands;
 mod guarding;
+mod outages;
 mod starting;
 mod tpdos;
 

@@ -22,9 +22,6 @@ const HIGH_LOAD_PERMILLE: u16 = 800;
 /// Rates are computed from counters at least this far apart.
 const RATE_INTERVAL: Duration = Duration::from_millis(500);
 
-/// More new errors than this between two reports, without one frame since the start, hint at a wrong bit rate.
-const ERROR_BURST: u64 = 10;
-
 /// A bus with its network.
 #[derive(Debug)]
 pub(super) struct Bus {
@@ -37,8 +34,14 @@ pub(super) struct Bus {
     members: Vec<NodeIndex>,
     /// When a frame came last, or since when frames can come.
     heard_at: Instant,
+    ever_heard: bool,
     silent: bool,
-    silence: Duration,
+    /// Silence is not looked for before so much of it, whichever nodes are expected.
+    shortest_silence: Duration,
+    /// When it is looked for next, if no frame comes until then.
+    look_at: Instant,
+    /// When frames came again after the bus was silent or could not be used.
+    back_at: Option<Instant>,
     counters: BusCounters,
     counted_at: Option<Instant>,
     /// Frames for which the queue to the bus was full.
@@ -61,7 +64,7 @@ impl Bus {
             members.push(NodeIndex(place));
             nodes.push(node.canopen.clone());
         }
-        let silence = nodes.iter().filter_map(longest_silence).min().unwrap_or(SILENCE).max(SILENCE);
+        let shortest_silence = silence(nodes.iter()).unwrap_or(SILENCE);
         Self {
             network: Network::new(NetworkSettings { role, start_broadcast, nodes }, now),
             status: BusStatus::default(),
@@ -70,8 +73,11 @@ impl Bus {
             by_id,
             members,
             heard_at: now.instant,
+            ever_heard: false,
             silent: false,
-            silence,
+            shortest_silence,
+            look_at: now.instant + shortest_silence,
+            back_at: None,
             counters: BusCounters::default(),
             counted_at: None,
             refused: 0,
@@ -84,10 +90,22 @@ impl Bus {
         self.link.is_some_and(Link::is_up)
     }
 
-    /// When it has been silent for too long, if no frame comes until then.
+    /// Whether the bus said that no frames can come.
+    fn is_known_down(&self) -> bool {
+        self.link.is_some_and(|link| !link.is_up())
+    }
+
+    /// When its silence is to be looked for, if no frame comes until then.
     pub(super) fn silent_at(&self) -> Option<Instant> {
         let watched = self.members.len() > 1 && self.is_up() && !self.silent;
-        watched.then_some(self.heard_at + self.silence)
+        watched.then_some(self.look_at)
+    }
+
+    /// A frame came, or frames can come from now on.
+    fn listen_from(&mut self, now: Instant) {
+        self.heard_at = now;
+        self.look_at = now + self.shortest_silence;
+        self.silent = false;
     }
 }
 
@@ -100,6 +118,20 @@ fn longest_silence(node: &NodeSettings) -> Option<Duration> {
             node.pdos.iter().filter_map(|pdo| pdo.timeout).min()
         }
     }
+}
+
+/// How long a bus with these nodes can be silent: until two of them should have been heard, since the silence of one
+/// is its own. `None` where there are no two.
+fn silence<'a>(nodes: impl Iterator<Item = &'a NodeSettings>) -> Option<Duration> {
+    let (mut shortest, mut second) = (None, None);
+    for silence in nodes.filter_map(longest_silence) {
+        if shortest.is_none_or(|shortest| silence < shortest) {
+            second = shortest.replace(silence);
+        } else if second.is_none_or(|second| silence < second) {
+            second = Some(silence);
+        }
+    }
+    second.map(|second| second.max(SILENCE))
 }
 
 impl Gateway {
@@ -115,33 +147,69 @@ impl Gateway {
         }
     }
 
-    /// While a bus has been quiet for so long that it may be silent altogether: until when that is decided.
-    pub(super) fn quiet_until(&self, now: Now, index: BusIndex) -> Option<Instant> {
-        let bus = self.buses.get(index.0)?;
-        let silent_at = bus.silent_at().filter(|at| *at > now.instant)?;
-        (now.instant.since(bus.heard_at) >= bus.silence / 2 && self.expects_frames(bus)).then_some(silent_at)
+    /// Whether a frame that comes now was on its way when the bus went down.
+    pub(super) fn comes_too_late(&self, index: BusIndex) -> bool {
+        self.buses.get(index.0).is_some_and(Bus::is_known_down)
     }
 
-    /// Whether at least two nodes should be heard all the time. The silence of a single one is that node's own, and
-    /// its own alarm tells of it better.
-    fn expects_frames(&self, bus: &Bus) -> bool {
-        let expected = bus.members.iter().filter(|index| {
-            let def: Option<&NodeDef> = self.table.nodes.get(index.0);
-            let node: Option<&Node> = self.nodes.get(index.0);
-            def.zip(node).is_some_and(|(def, node)| node.is_expected(def))
+    /// While the loss of a node may turn out to be the silence of its bus, or the node may only be slow to come back
+    /// after that: until when that is decided.
+    pub(super) fn undecided_until(&self, now: Now, node: &NodeSettings, index: BusIndex) -> Option<Instant> {
+        let bus = self.buses.get(index.0)?;
+        let back = bus.back_at.map(|at| at + longest_silence(node).unwrap_or(SILENCE));
+        self.silent_from(now, index).max(back).filter(|until| *until > now.instant)
+    }
+
+    /// While a bus has been quiet for so long that it may be silent altogether: from when on it will be.
+    fn silent_from(&self, now: Now, index: BusIndex) -> Option<Instant> {
+        let bus = self.buses.get(index.0)?;
+        let quiet = now.instant.since(bus.heard_at);
+        if bus.silent_at().is_none() || quiet < bus.shortest_silence / 2 {
+            return None;
+        }
+        let silence = self.silence_of(bus)?;
+        (quiet >= silence / 2).then_some(bus.heard_at + silence).filter(|at| *at > now.instant)
+    }
+
+    /// How long a bus can be silent; `None` unless at least two nodes should be heard all the time. The silence of a
+    /// single one is that node's own, and its own alarm tells of it better. So is that of a node that was missing
+    /// already while others were heard.
+    fn silence_of(&self, bus: &Bus) -> Option<Duration> {
+        let expected = bus.members.iter().filter_map(|index| {
+            let def: &NodeDef = self.table.nodes.get(index.0)?;
+            let node: &Node = self.nodes.get(index.0)?;
+            let missing = node.is_missing() && node.missing_since <= Some(bus.heard_at);
+            (!missing && node.is_expected(def)).then_some(&def.canopen)
         });
-        expected.count() > 1
+        silence(expected)
+    }
+
+    /// Frames come again, or can come again, after nobody could be heard. What was known of the nodes' absence says
+    /// nothing any more: each has the time that it may be silent for to show itself, and until then the end of the
+    /// bus's own alarm does not raise theirs.
+    fn begin_anew(&mut self, now: Now, index: BusIndex) {
+        let Some(bus) = self.buses.get_mut(index.0) else { return };
+        bus.back_at = Some(now.instant);
+        for node in bus.members.clone() {
+            let owner = AlarmOwner::Node(node);
+            self.conditions.set(now, owner, BuiltIn::NodeLost, false);
+            self.conditions.set(now, owner, BuiltIn::NodeNeverSeen, false);
+        }
     }
 
     pub(super) fn bus_frame(&mut self, now: Now, index: BusIndex, frame: &CanFrame) {
-        let was_quiet = self.quiet_until(now, index).is_some();
+        let was_quiet = self.silent_from(now, index).is_some();
         let Some(bus) = self.buses.get_mut(index.0) else { return };
-        bus.heard_at = now.instant;
-        let was_silent = std::mem::take(&mut bus.silent);
-        bus.network.handle_frame(now, frame);
+        let was_silent = bus.silent;
+        bus.listen_from(now.instant);
+        bus.ever_heard = true;
         if was_silent {
+            self.begin_anew(now, index);
             self.conditions.set(now, AlarmOwner::Bus(index), BuiltIn::BusSilent, false);
             self.tell_bus(now, index, "bus_heard", |_| ());
+        }
+        if let Some(bus) = self.buses.get_mut(index.0) {
+            bus.network.handle_frame(now, frame);
         }
         self.drain_network(now, index);
         if was_quiet || was_silent {
@@ -159,11 +227,10 @@ impl Gateway {
         bus.status.state = state(link);
         let (after, up) = (bus.status.state, bus.is_up());
         if up != was_up {
-            bus.heard_at = now.instant;
-            bus.silent = false;
+            bus.listen_from(now.instant);
             bus.network.handle_link(now, up);
         }
-        let never_heard = bus.counters.frames_received == 0;
+        let never_heard = !bus.ever_heard;
         let members = if up { Vec::new() } else { bus.members.clone() };
         self.dirty_buses.mark(index.0);
         self.tell_bus(now, index, "bus_state", |event| {
@@ -175,6 +242,9 @@ impl Gateway {
                     .into();
             }
         });
+        if up && !was_up {
+            self.begin_anew(now, index);
+        }
         let owner = AlarmOwner::Bus(index);
         self.conditions.set(now, owner, BuiltIn::BusOff, after == BusState::BusOff);
         let down = matches!(after, BusState::Absent | BusState::Down);
@@ -206,7 +276,7 @@ impl Gateway {
     pub(super) fn bus_refused(&mut self, now: Now, index: BusIndex, frame: &CanFrame) {
         if let Some(bus) = self.buses.get_mut(index.0) {
             bus.refused = bus.refused.saturating_add(1);
-            bus.status.frames_not_sent = bus.counters.frames_not_sent.saturating_add(bus.refused);
+            bus.status.frames_not_sent = bus.status.frames_not_sent.saturating_add(1);
             self.dirty_buses.mark(index.0);
         }
         self.bus_not_sent(now, index, frame);
@@ -255,7 +325,7 @@ impl Gateway {
                     format!("the kernel dropped {new_overruns} frames: this host is too slow or too busy");
             });
         }
-        if new_errors > ERROR_BURST && counters.frames_received == 0 {
+        if new_errors > 0 && counters.bit_rate_is_suspect() {
             self.tell_bus(now, index, "bus_errors", |event| {
                 event.value = Some(Value::Unsigned(new_errors));
                 event.text =
@@ -270,17 +340,18 @@ impl Gateway {
         if bus.silent_at().is_none_or(|at| at > now.instant) {
             return;
         }
-        let expected = self.expects_frames(bus);
+        let silence = self.silence_of(bus);
         let Some(bus) = self.buses.get_mut(index.0) else { return };
-        if expected {
-            bus.silent = true;
-            let silence = bus.silence;
-            self.conditions.set(now, AlarmOwner::Bus(index), BuiltIn::BusSilent, true);
-            self.tell_bus(now, index, "bus_silent", |event| {
-                event.text = format!("no frame from anyone for {silence:?}");
-            });
-        } else {
-            bus.heard_at = now.instant;
+        match silence {
+            Some(silence) if bus.heard_at + silence <= now.instant => {
+                bus.silent = true;
+                self.conditions.set(now, AlarmOwner::Bus(index), BuiltIn::BusSilent, true);
+                self.tell_bus(now, index, "bus_silent", |event| {
+                    event.text = format!("no frame from anyone for {silence:?}");
+                });
+            }
+            Some(silence) => bus.look_at = bus.heard_at + silence,
+            None => bus.look_at = now.instant + bus.shortest_silence,
         }
         self.refresh_nodes_of(now, index);
     }

@@ -37,12 +37,27 @@ pub(super) struct Node {
     pub(super) last_toggle_error: Option<Instant>,
     /// Guard requests stay without answer: until then it will have answered, or be lost.
     pub(super) suspect_until: Option<Instant>,
-    /// By TPDO: when its data is too old, where that can happen and has not yet.
-    pub(super) fresh_until: Vec<Option<Instant>>,
-    /// By TPDO: set reserved bits of the last frame.
-    pub(super) reserved: Vec<u64>,
-    /// By TPDO: that it is too long has been told.
-    pub(super) told_too_long: Vec<bool>,
+    /// When it was lost, or reported as never seen, the last time.
+    pub(super) missing_since: Option<Instant>,
+    /// When it came back the last time.
+    pub(super) recovered_at: Option<Instant>,
+    /// Nothing came since the data of all its supervised TPDOs became too old, and nothing else watches it.
+    pub(super) fell_silent: bool,
+    /// By TPDO.
+    pub(super) watches: Vec<PdoWatch>,
+}
+
+/// What is remembered of a TPDO beside what readers see.
+#[derive(Clone, Debug, Default)]
+pub(super) struct PdoWatch {
+    /// When its data is too old, where that can happen and has not yet.
+    pub(super) fresh_until: Option<Instant>,
+    /// Its alarm is not raised before: when it did not come, the cause could still have been another.
+    pub(super) held_until: Option<Instant>,
+    /// Set reserved bits of the last frame.
+    pub(super) reserved: u64,
+    /// That it is too long has been told.
+    pub(super) told_too_long: bool,
 }
 
 /// Why a node cannot be booted.
@@ -88,15 +103,19 @@ impl Node {
             foreign_guard: false,
             last_toggle_error: None,
             suspect_until: None,
-            fresh_until: vec![None; pdos.len()],
-            reserved: vec![0; pdos.len()],
-            told_too_long: vec![false; pdos.len()],
+            missing_since: None,
+            recovered_at: None,
+            fell_silent: false,
+            watches: vec![PdoWatch::default(); pdos.len()],
         }
     }
 
-    /// How far data that comes now can be trusted (R-DET-037, P22).
-    pub(super) fn quality_of_new_data(&self) -> Quality {
-        if self.lost.is_some() {
+    /// How far data that comes now can be trusted (R-DET-037, P22). `too_late`: its bus is known to be down, so that it
+    /// was on its way before.
+    pub(super) fn quality_of_new_data(&self, too_late: bool) -> Quality {
+        if too_late {
+            Quality::Uncertain(Reason::BusUnavailable)
+        } else if self.lost.is_some() {
             Quality::Uncertain(Reason::NodeLost)
         } else if self.duplicate {
             Quality::Uncertain(Reason::DuplicateNode)
@@ -110,6 +129,19 @@ impl Node {
         self.contact = false;
         self.supervised = false;
         self.suspect_until = None;
+        self.clear_stale_pdos();
+    }
+
+    /// Lost, or never seen.
+    pub(super) fn is_missing(&self) -> bool {
+        self.lost.is_some() || self.never_seen
+    }
+
+    /// It is about to be lost, or to be reported as never seen.
+    pub(super) fn begin_missing(&mut self, now: Now) {
+        if !self.is_missing() {
+            self.missing_since = Some(now.instant);
+        }
     }
 
     /// Whether frames are to be expected of it all the time.
@@ -121,9 +153,9 @@ impl Node {
 
     /// The data of a TPDO, or of all, is not usable any more and need not be watched.
     pub(super) fn lose_data_of(&mut self, pdo: Option<PdoIndex>) {
-        let pdos = self.fresh_until.iter_mut().zip(&mut self.status.pdos).enumerate();
-        for (_, (fresh_until, status)) in pdos.filter(|(place, _)| pdo.is_none_or(|pdo| pdo.0 == *place)) {
-            *fresh_until = None;
+        let pdos = self.watches.iter_mut().zip(&mut self.status.pdos).enumerate();
+        for (_, (watch, status)) in pdos.filter(|(place, _)| pdo.is_none_or(|pdo| pdo.0 == *place)) {
+            watch.fresh_until = None;
             status.usable = false;
         }
     }
@@ -163,7 +195,7 @@ impl Node {
             None => {}
         }
         if !self.contact {
-            return "waiting for its first frame".to_owned();
+            return format!("waiting for its {} frame", if self.ever_seen { "next" } else { "first" });
         }
         match &self.boot_trouble {
             Some(BootTrouble::NoAnswer) => {
@@ -182,6 +214,9 @@ impl Node {
         }
         match self.nmt {
             Some(NmtState::Stopped) if self.stop_ordered => return "stopped by a command".to_owned(),
+            Some(_) | None if self.fell_silent => {
+                return format!("nothing comes from node {id}; check its power and cable");
+            }
             Some(state @ (NmtState::Stopped | NmtState::PreOperational | NmtState::Initialising)) => {
                 return format!("not operational: {}", state.word());
             }
@@ -215,32 +250,33 @@ impl Gateway {
     pub(super) fn refresh_node(&mut self, now: Now, index: NodeIndex) {
         let Some(def) = self.table.nodes.get(index.0) else { return };
         let bus_trouble = self.bus_trouble(def.bus);
-        let quiet_until = self.quiet_until(now, def.bus);
+        let undecided_until = self.undecided_until(now, &def.canopen, def.bus);
         let Some(node) = self.nodes.get_mut(index.0) else { return };
         let status = &mut node.status;
-        status.online = node.contact && node.lost.is_none() && bus_trouble.is_none();
+        status.online = node.contact && node.lost.is_none() && !node.fell_silent && bus_trouble.is_none();
         status.nmt = node.nmt.filter(|_| status.online);
         status.supervised = status.online && node.supervised;
         node.status.reason = node.reason(def, bus_trouble.as_deref());
         self.dirty_nodes.mark(index.0);
 
         let owner = AlarmOwner::Node(index);
-        let suspect_until = node.suspect_until.filter(|until| *until > now.instant);
         // A node that never was there was not lost: that has an alarm of its own, which names other causes.
         let (lost, never_seen) = (node.lost.is_some() && node.ever_seen, node.never_seen);
         let boot_failed = node.contact && node.boot_trouble.is_some();
         let start_failed = node.start_failed.is_some() || node.start_held_back || boot_failed;
         let (duplicate, foreign_guard) = (node.duplicate, node.foreign_guard);
-        self.raise(now, owner, BuiltIn::NodeLost, lost, quiet_until);
-        self.conditions.set(now, owner, BuiltIn::NodeNeverSeen, never_seen);
+        self.raise(now, owner, BuiltIn::NodeLost, lost, undecided_until);
+        self.raise(now, owner, BuiltIn::NodeNeverSeen, never_seen, undecided_until);
         self.conditions.set(now, owner, BuiltIn::NotOperational, start_failed);
         self.conditions.set(now, owner, BuiltIn::DuplicateNode, duplicate);
         self.conditions.set(now, owner, BuiltIn::ForeignGuardMaster, foreign_guard);
-        let pdos = self.nodes.get(index.0).map_or(0, |node| node.status.pdos.len());
+        let pdos = self.nodes.get(index.0).map_or(0, |node| node.watches.len());
         for pdo in 0..pdos {
-            let status = self.nodes.get(index.0).and_then(|node| node.status.pdos.get(pdo));
-            let stale = status.is_some_and(|pdo| pdo.stale);
-            self.raise(now, owner, BuiltIn::PdoTimeout(pdo), stale, quiet_until.or(suspect_until));
+            let Some(node) = self.nodes.get(index.0) else { continue };
+            let stale = node.status.pdos.get(pdo).is_some_and(|status| status.stale);
+            let held_until = node.watches.get(pdo).and_then(|watch| watch.held_until);
+            let held_until = held_until.filter(|until| *until > now.instant);
+            self.raise(now, owner, BuiltIn::PdoTimeout(pdo), stale, held_until);
         }
     }
 
@@ -273,17 +309,30 @@ impl Gateway {
     }
 
     fn expire_pdo(&mut self, now: Now, index: NodeIndex, pdo: PdoIndex) {
-        let Some(node) = self.nodes.get_mut(index.0) else { return };
-        let Some(fresh_until) = node.fresh_until.get_mut(pdo.0) else { return };
-        match *fresh_until {
+        let Some(node) = self.nodes.get(index.0) else { return };
+        match node.watches.get(pdo.0).and_then(|watch| watch.fresh_until) {
             Some(until) if until <= now.instant => {
                 let lost = node.lost.is_some();
                 let quality =
                     if lost { Quality::Bad(Reason::NodeLost) } else { Quality::Stale(Reason::PdoTimeout) };
                 self.degrade(now, index, Some(pdo), quality);
+                self.look_for_silence(now, index);
             }
             Some(until) => self.expire_at(until),
             None => {}
+        }
+    }
+
+    /// A node that nothing watches but the time-outs of its TPDOs is there no longer than the last of them.
+    pub(super) fn look_for_silence(&mut self, now: Now, index: NodeIndex) {
+        let (Some(def), Some(node)) = (self.table.nodes.get(index.0), self.nodes.get_mut(index.0)) else {
+            return;
+        };
+        let mut supervised =
+            def.canopen.pdos.iter().zip(&node.status.pdos).filter(|(settings, _)| settings.timeout.is_some());
+        if !is_watched(def) && supervised.all(|(_, status)| !status.usable) {
+            node.fell_silent = true;
+            self.refresh_node(now, index);
         }
     }
 

@@ -88,46 +88,56 @@ impl Gateway {
         counters.frames_received = counters.frames_received.saturating_add(1);
         node.ever_seen = true;
         self.dirty_nodes.mark(index.0);
-        if !std::mem::replace(&mut node.contact, true) {
+        let fell_silent = std::mem::take(&mut node.fell_silent);
+        if !self.make_contact(index) || fell_silent {
             self.refresh_node(now, index);
         }
     }
 
+    /// The node showed itself, unless what it sent was on its way before its bus went down. Whether it had contact.
+    fn make_contact(&mut self, index: NodeIndex) -> bool {
+        let too_late = self.table.nodes.get(index.0).is_some_and(|def| self.comes_too_late(def.bus));
+        let Some(node) = self.nodes.get_mut(index.0) else { return true };
+        let had_contact = node.contact;
+        node.contact |= !too_late;
+        had_contact
+    }
+
     fn pdo(&mut self, at: (Now, NodeIndex), pdo: PdoIndex, mut data: [u8; 8], length: u8) {
         let (now, index) = at;
-        let (Some(def), Some(node)) = (self.table.nodes.get(index.0), self.nodes.get_mut(index.0)) else {
+        let Some(def) = self.table.nodes.get(index.0) else { return };
+        let too_late = self.comes_too_late(def.bus);
+        let Some(node) = self.nodes.get_mut(index.0) else { return };
+        let quality = node.quality_of_new_data(too_late);
+        let (Some(status), Some(watch)) = (node.status.pdos.get_mut(pdo.0), node.watches.get_mut(pdo.0))
+        else {
             return;
         };
-        let Some(status) = node.status.pdos.get_mut(pdo.0) else { return };
         status.last_received = Some(now.instant);
         status.received = status.received.saturating_add(1);
         let was_stale = std::mem::take(&mut status.stale);
         let number = status.number;
         status.usable = true;
         node.status.newest_data = Some(now.utc);
-        let quality = node.quality_of_new_data();
-        let fresh_until =
-            def.canopen.pdos.get(pdo.0).and_then(|pdo| pdo.timeout).map(|timeout| now.instant + timeout);
-        if let Some(known) = node.fresh_until.get_mut(pdo.0) {
-            *known = fresh_until;
-        }
+        let timeout = def.canopen.pdos.get(pdo.0).and_then(|pdo| pdo.timeout);
+        watch.fresh_until = timeout.map(|timeout| now.instant + timeout);
+        watch.held_until = None;
+        let fresh_until = watch.fresh_until;
 
         if let Some(padding) = data.get_mut(usize::from(length)..) {
             padding.fill(0);
         }
         let reserved = def.reserved_bits.get(pdo.0).copied().unwrap_or(0) & u64::from_le_bytes(data);
-        let before = node.reserved.get_mut(pdo.0).map(|before| std::mem::replace(before, reserved));
+        let before = std::mem::replace(&mut watch.reserved, reserved);
         let used = data.get(..usize::from(length)).unwrap_or(&data);
-        if self.tags.apply(&self.table, now, (index, pdo.into()), used, quality) {
-            node.status.generation = node.status.generation.wrapping_add(1);
-        }
+        self.tags.apply(&self.table, now, (index, pdo.into()), used, quality);
         self.dirty_nodes.mark(index.0);
         if let Some(until) = fresh_until {
             self.expire_at(until);
         }
         if reserved != 0 {
             self.count(index, |counters| &mut counters.reserved_bits);
-            if before != Some(reserved) {
+            if before != reserved {
                 self.tell(at, "reserved_bits", |event| {
                     event.value = Some(Value::Unsigned(reserved));
                     event.text = format!("TPDO{number} has bits set that are reserved: 0x{reserved:016X}");
@@ -145,13 +155,15 @@ impl Gateway {
         let settings = self.table.nodes.get(index.0).and_then(|def| def.canopen.pdos.get(pdo.0));
         let Some((number, expected)) = settings.map(|pdo| (pdo.number, pdo.length)) else { return };
         self.count(index, |counters| &mut counters.pdo_length_errors);
-        self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::PdoLength);
         let too_long = received > expected;
-        if too_long {
-            let told = self.nodes.get_mut(index.0).and_then(|node| node.told_too_long.get_mut(pdo.0));
-            if told.is_some_and(|told| std::mem::replace(told, true)) {
-                return;
-            }
+        let watch = self.nodes.get_mut(index.0).and_then(|node| node.watches.get_mut(pdo.0));
+        let told = too_long && watch.is_some_and(|watch| std::mem::replace(&mut watch.told_too_long, true));
+        // One whose first bytes are used needs somebody to look at it once; data that is discarded is missing.
+        if discarded || !told {
+            self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::PdoLength);
+        }
+        if told {
+            return;
         }
         let name = if too_long { "pdo_length_exceeded" } else { "pdo_length_error" };
         self.tell(at, name, |event| {
@@ -163,12 +175,20 @@ impl Gateway {
 
     fn pdo_timeout(&mut self, at: (Now, NodeIndex), pdo: PdoIndex) {
         let (now, index) = at;
+        let Some(def) = self.table.nodes.get(index.0) else { return };
+        // Decided once: what the node or its bus do later must not put off the alarm again and again.
+        let undecided_until = self.undecided_until(now, &def.canopen, def.bus);
         self.change(index, |node| {
-            if let Some(status) = node.status.pdos.get_mut(pdo.0) {
+            let held_until = undecided_until.max(node.suspect_until);
+            if let (Some(status), Some(watch)) =
+                (node.status.pdos.get_mut(pdo.0), node.watches.get_mut(pdo.0))
+            {
                 status.stale = true;
+                watch.held_until = held_until;
             }
         });
         self.degrade(now, index, Some(pdo), Quality::Stale(Reason::PdoTimeout));
+        self.look_for_silence(now, index);
         let number = self.pdo_number(index, pdo);
         self.tell(at, "pdo_timeout", |event| event.text = format!("TPDO{number} did not come in time"));
     }
@@ -191,15 +211,14 @@ impl Gateway {
     }
 
     fn seen(&mut self, at: (Now, NodeIndex)) {
-        self.change(at.1, |node| {
-            node.never_seen = false;
-            node.contact = true;
-        });
+        self.change(at.1, |node| node.never_seen = false);
+        self.make_contact(at.1);
         self.tell(at, "node_seen", |_| ());
     }
 
     fn never_seen(&mut self, at: (Now, NodeIndex)) {
         self.change(at.1, |node| {
+            node.begin_missing(at.0);
             node.never_seen = true;
             node.contact = false;
         });
@@ -235,11 +254,15 @@ impl Gateway {
 
     fn restarted(&mut self, at: (Now, NodeIndex)) {
         let (now, index) = at;
-        self.change(index, |node| node.told_too_long.fill(false));
+        self.change(index, |node| node.watches.iter_mut().for_each(|watch| watch.told_too_long = false));
         self.count(index, |counters| &mut counters.restarts);
         self.degrade(now, index, None, Quality::Stale(Reason::NodeRestarted));
         self.tell(at, "node_restarted", |event| event.text = "the node restarted unasked".into());
-        self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::Restarted);
+        // That it was lost has an alarm of its own; the boot-up that ended the loss is no second cause.
+        let was_lost = self.nodes.get(index.0).is_some_and(|node| node.recovered_at == Some(now.instant));
+        if !was_lost {
+            self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::Restarted);
+        }
     }
 
     fn invalid_state(&mut self, at: (Now, NodeIndex), raw: u8) {
@@ -291,9 +314,11 @@ impl Gateway {
         let loss = if stuck_toggle { Loss::StuckToggle } else { Loss::Silence };
         let mut was_there = false;
         self.change(index, |node| {
+            node.begin_missing(now);
             node.lost = Some(loss);
             node.supervised = false;
             node.suspect_until = None;
+            node.clear_stale_pdos();
             node.told_lost = node.ever_seen;
             was_there = node.ever_seen;
         });
@@ -309,10 +334,11 @@ impl Gateway {
         let mut told_lost = false;
         self.change(at.1, |node| {
             node.lost = None;
-            node.contact = true;
+            node.recovered_at = Some(at.0.instant);
             node.suspect_until = None;
             told_lost = std::mem::take(&mut node.told_lost);
         });
+        self.make_contact(at.1);
         if told_lost {
             self.tell(at, "node_recovered", |_| ());
         }
