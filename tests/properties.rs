@@ -3,8 +3,8 @@
 use cangate::can::{BusCounters, BusEvent, Link};
 use cangate::canopen::NmtRequest;
 use cangate::gateway::{Action, Health, Input};
-use cangate::mapping::Source;
-use cangate::process_image::{AlarmIndex, NodeIndex};
+use cangate::mapping::{Derived, Source};
+use cangate::process_image::{AlarmIndex, BusState, NodeIndex, Quality, TagIndex};
 use cangate::time::Now;
 use proptest::prelude::*;
 
@@ -110,17 +110,41 @@ fn take(conversation: &mut Conversation, step: &Step) {
     }
 }
 
-/// P26: a tag of a TPDO is good only while its TPDO is younger than its timeout.
+/// P26: a tag of a TPDO is usable only while its TPDO is younger than its timeout, and good only while its bus is not
+/// known to be down; a computed tag is no better than what it must be computed from.
 fn nothing_old_is_good(conversation: &Conversation) {
     let now = Now::from_millis(conversation.now_millis()).instant;
-    for (def, sample) in conversation.table.tags.iter().zip(&conversation.image.tags) {
-        let Source::Pdo { pdo, .. } = &def.source else { continue };
-        let Some(timeout) = conversation.table.node(def.node).unwrap().canopen.pdos[*pdo].timeout else {
-            continue;
-        };
-        if sample.quality.is_usable() {
-            let age = now.since(sample.received_at.expect("a usable value was received"));
-            assert!(age <= timeout, "{} is {} after {age:?}", def.name, sample.quality);
+    let (table, image) = (&conversation.table, &conversation.image);
+    for (def, sample) in table.tags.iter().zip(&image.tags) {
+        let node = table.node(def.node).unwrap();
+        let bus = image.buses[node.bus.0].state;
+        match &def.source {
+            Source::Pdo { pdo, .. } => {
+                let down = matches!(bus, BusState::Absent | BusState::Down | BusState::BusOff);
+                assert!(!sample.quality.is_good() || !down, "{} is good though its bus is {bus:?}", def.name);
+                let timeout = node.canopen.pdos[*pdo].timeout.unwrap();
+                if sample.quality.is_usable() {
+                    let age = now.since(sample.received_at.expect("a usable value was received"));
+                    assert!(age <= timeout, "{} is {} after {age:?}", def.name, sample.quality);
+                }
+            }
+            Source::Derived(derived) => {
+                let best = |tags: &[TagIndex]| {
+                    tags.iter().map(|tag| image.tag(*tag).quality).min().unwrap_or(Quality::Good)
+                };
+                let worst = |tags: &[TagIndex]| image.worst_quality(tags.iter().copied());
+                let limit = match derived {
+                    // Of the candidates some may be left out.
+                    Derived::Maximum { among, .. } | Derived::ArgMaximum { among, .. } => best(among),
+                    Derived::Margin { among, limit, .. } => best(among).worst(worst(&[*limit])),
+                    _ => {
+                        let mut inputs = Vec::new();
+                        derived.for_each_input(&mut |tag| inputs.push(tag));
+                        worst(&inputs)
+                    }
+                };
+                assert!(sample.quality >= limit, "{} is {}, not {limit}", def.name, sample.quality);
+            }
         }
     }
 }

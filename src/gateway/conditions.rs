@@ -1,14 +1,15 @@
 //! Alarms: their conditions on tags, the conditions that the gateway itself watches, and their list.
 //!
 //! A condition of a mapping is decided from values that can be used only. Where one of them cannot, the rest may
-//! still decide (`a or b` holds when `a` does); if not, the condition stays as it was: an alarm is neither raised
-//! nor cleared by data that nobody should act on.
+//! still decide (`a or b` holds when `a` does, and two faults that are known are at least two); if not, the condition
+//! stays as it was: an alarm is neither raised nor cleared by data that nobody should act on.
 
 use std::collections::BTreeMap;
 
 use crate::alarms::{AlarmList, AlarmSpec, Transition};
-use crate::mapping::{AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, Expression, TagTable};
-use crate::process_image::{AlarmIndex, AlarmStatus, Quality, Revision, Sample, TagIndex, Value};
+use crate::mapping::expression::{Comparison, Operand};
+use crate::mapping::{AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, Derived, Expression, Source, TagTable};
+use crate::process_image::{AlarmIndex, AlarmStatus, Revision, Sample, TagIndex};
 use crate::time::{Instant, Now};
 
 use super::marks::Marks;
@@ -39,10 +40,14 @@ impl Conditions {
                 }
                 AlarmCondition::Tags(expression) => {
                     outdated.mark(place);
-                    expression.for_each_tag(&mut |tag| {
+                    let mut look_at = |tag: TagIndex| {
                         if let Some(alarms) = by_tag.get_mut(tag.0) {
                             alarms.push(AlarmIndex(place));
                         }
+                    };
+                    expression.for_each_tag(&mut |tag| {
+                        look_at(tag);
+                        counted(table, tag).iter().copied().for_each(&mut look_at);
                     });
                 }
             }
@@ -89,17 +94,17 @@ impl Conditions {
 
     /// Looks at the conditions of which an input changed.
     pub(super) fn evaluate(&mut self, now: Now, table: &TagTable, tags: &[Sample]) {
-        let sample = |tag: TagIndex| tags.get(tag.0).unwrap_or(&Sample::NEVER);
+        let inputs = Inputs { table, tags };
         for place in self.outdated.drain() {
             let Some(alarm) = table.alarms.get(place) else { continue };
             let AlarmCondition::Tags(expression) = &alarm.condition else { continue };
-            let look = |tag| (sample(tag).value, sample(tag).quality);
-            let (Some(holds), Some(held)) = (decide(expression, &look), self.holds.get_mut(place)) else {
+            let (Some(holds), Some(held)) = (decide(expression, &inputs), self.holds.get_mut(place)) else {
                 continue;
             };
             if *held != holds {
                 *held = holds;
-                let value = alarm.value.map(sample).filter(|sample| sample.quality.is_usable());
+                let value =
+                    alarm.value.map(|tag| inputs.sample(tag)).filter(|sample| sample.quality.is_usable());
                 self.list.set_condition(now, AlarmIndex(place), holds, value.map(|sample| sample.value));
             }
         }
@@ -162,12 +167,57 @@ fn spec(table: &TagTable, alarm: &AlarmDef) -> AlarmSpec {
     }
 }
 
+/// The tags that a count looks at; none of another tag.
+fn counted(table: &TagTable, tag: TagIndex) -> &[TagIndex] {
+    match table.tag(tag).map(|tag| &tag.source) {
+        Some(Source::Derived(Derived::Count { of })) => of,
+        Some(Source::Derived(_) | Source::Pdo { .. }) | None => &[],
+    }
+}
+
+/// What conditions look at.
+#[derive(Clone, Copy)]
+struct Inputs<'a> {
+    table: &'a TagTable,
+    tags: &'a [Sample],
+}
+
+impl Inputs<'_> {
+    fn sample(&self, tag: TagIndex) -> &Sample {
+        self.tags.get(tag.0).unwrap_or(&Sample::NEVER)
+    }
+
+    /// The lowest and the highest that a value can be. For a count of which some inputs cannot be used that is known all
+    /// the same: each of them is in or is not. `None` for other values that cannot be used.
+    fn bounds(&self, operand: Operand) -> Option<[f64; 2]> {
+        let tag = match operand {
+            Operand::Number(number) => return Some([number, number]),
+            Operand::Tag(tag) => tag,
+        };
+        let sample = self.sample(tag);
+        if sample.quality.is_usable() {
+            let value = sample.value.as_f64();
+            return Some([value, value]);
+        }
+        let of = counted(self.table, tag);
+        if of.is_empty() {
+            return None;
+        }
+        let bounds = of.iter().map(|tag| self.sample(*tag)).fold([0_u32, 0], |[low, high], input| {
+            let usable = input.quality.is_usable();
+            let set = input.value.is_true();
+            [low + u32::from(usable && set), high + u32::from(!usable || set)]
+        });
+        Some(bounds.map(f64::from))
+    }
+}
+
 /// Whether a condition holds; `None` where that depends on a value that cannot be used.
-fn decide(expression: &Expression, tag: &impl Fn(TagIndex) -> (Value, Quality)) -> Option<bool> {
+fn decide(expression: &Expression, inputs: &Inputs<'_>) -> Option<bool> {
     let join = |parts: &[Expression], decisive: bool| {
         let mut outcome = Some(!decisive);
         for part in parts {
-            match decide(part, tag) {
+            match decide(part, inputs) {
                 Some(holds) if holds == decisive => return Some(decisive),
                 Some(_) => {}
                 None => outcome = None,
@@ -178,27 +228,52 @@ fn decide(expression: &Expression, tag: &impl Fn(TagIndex) -> (Value, Quality)) 
     match expression {
         Expression::And(parts) => join(parts, false),
         Expression::Or(parts) => join(parts, true),
-        Expression::Not(part) => decide(part, tag).map(|holds| !holds),
-        Expression::Tag(_) | Expression::Compare { .. } => {
-            let (holds, quality) = expression.evaluate(tag);
-            quality.is_usable().then_some(holds)
+        Expression::Not(part) => decide(part, inputs).map(|holds| !holds),
+        Expression::Tag(tag) => {
+            let sample = inputs.sample(*tag);
+            sample.quality.is_usable().then_some(sample.value.is_true())
+        }
+        Expression::Compare { left, comparison, right } => {
+            compare(inputs.bounds(*left)?, *comparison, inputs.bounds(*right)?)
         }
     }
+}
+
+/// Compares two values of which only bounds may be known; `None` where these do not decide.
+fn compare(left: [f64; 2], comparison: Comparison, right: [f64; 2]) -> Option<bool> {
+    let [[left_low, left_high], [right_low, right_high]] = [left, right];
+    // The ends at which the comparison holds most and least readily.
+    let (most, least) = match comparison {
+        Comparison::Less | Comparison::LessOrEqual => ((left_low, right_high), (left_high, right_low)),
+        Comparison::Greater | Comparison::GreaterOrEqual => ((left_high, right_low), (left_low, right_high)),
+        Comparison::Equal | Comparison::NotEqual => {
+            let apart = left_high < right_low || right_high < left_low;
+            let known = left_low.total_cmp(&left_high).is_eq() && right_low.total_cmp(&right_high).is_eq();
+            if apart {
+                return Some(comparison == Comparison::NotEqual);
+            }
+            return known.then(|| comparison.holds(left_low, right_low));
+        }
+    };
+    let holds = comparison.holds(least.0, least.1);
+    (holds == comparison.holds(most.0, most.1)).then_some(holds)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::process_image::Reason;
+    use crate::process_image::{Quality, Reason, Value};
 
     #[test]
     fn a_condition_is_decided_from_values_that_can_be_used() {
+        let table = TagTable::default();
+        let bit = |value, quality| Sample { value: Value::Bool(value), quality, ..Sample::NEVER };
         let tags = [
-            (Value::Bool(true), Quality::Good),
-            (Value::Bool(false), Quality::Uncertain(Reason::NodeLost)),
-            (Value::Bool(true), Quality::Stale(Reason::PdoTimeout)),
+            bit(true, Quality::Good),
+            bit(false, Quality::Uncertain(Reason::NodeLost)),
+            bit(true, Quality::Stale(Reason::PdoTimeout)),
         ];
-        let look = |tag: TagIndex| tags[tag.0];
+        let look = Inputs { table: &table, tags: &tags };
         let [yes, no, unknown] = [0, 1, 2].map(|tag| Expression::Tag(TagIndex(tag)));
         let and = |left: &Expression, right: &Expression| {
             decide(&Expression::And(vec![left.clone(), right.clone()]), &look)
@@ -211,5 +286,31 @@ mod tests {
         assert_eq!((and(&yes, &unknown), and(&unknown, &no)), (None, Some(false)));
         assert_eq!((or(&yes, &unknown), or(&unknown, &no)), (Some(true), None));
         assert_eq!((and(&yes, &no), or(&no, &yes)), (Some(false), Some(true)));
+    }
+    #[test]
+    fn what_is_known_of_a_count_decides_where_it_can() {
+        use Comparison::{Equal, Greater, GreaterOrEqual, Less, LessOrEqual, NotEqual};
+        for (comparison, number, expected) in [
+            (GreaterOrEqual, 2.0, Some(true)),
+            (GreaterOrEqual, 3.0, None),
+            (GreaterOrEqual, 5.0, Some(false)),
+            (Greater, 1.0, Some(true)),
+            (Greater, 4.0, Some(false)),
+            (Less, 5.0, Some(true)),
+            (Less, 3.0, None),
+            (Less, 2.0, Some(false)),
+            (LessOrEqual, 4.0, Some(true)),
+            (LessOrEqual, 1.0, Some(false)),
+            (Equal, 3.0, None),
+            (Equal, 5.0, Some(false)),
+            (NotEqual, 1.0, Some(true)),
+            (NotEqual, 2.0, None),
+        ] {
+            let between = [2.0, 4.0];
+            assert_eq!(compare(between, comparison, [number, number]), expected, "{comparison:?} {number}");
+        }
+        assert_eq!(compare([1.0, 1.0], Less, [2.0, 4.0]), Some(true));
+        assert_eq!(compare([3.0, 3.0], Less, [2.0, 4.0]), None);
+        assert_eq!(compare([3.0, 3.0], Equal, [3.0, 3.0]), Some(true));
     }
 }

@@ -8,6 +8,7 @@ use super::conditions::Conditions;
 use super::events::{EventLog, Name};
 use super::marks::Marks;
 use super::node::Node;
+use super::operate::Finished;
 use super::tags::{CarrierIndex, Tags};
 use super::{Command, Outcome};
 use crate::can::{BusEvent, BusIndex, CanFrame};
@@ -76,6 +77,8 @@ pub struct Gateway {
     pub(super) dirty_buses: Marks,
     /// Taken after each input, so that it holds what one input causes and no more.
     pub(super) outputs: VecDeque<Output>,
+    /// Commands that are answered when all outputs were taken. No more than were asked for by one input.
+    pub(super) finished: Vec<Finished>,
     /// When alarms that are held back are to be looked at again.
     pub(super) next_look: Option<Instant>,
     /// When the data of a TPDO may be too old.
@@ -99,6 +102,7 @@ impl Gateway {
             dirty_nodes: Marks::new(nodes.len()),
             dirty_buses: Marks::new(table.buses.len()),
             outputs: VecDeque::new(),
+            finished: Vec::new(),
             next_look: None,
             next_expiry: None,
             nodes,
@@ -147,7 +151,9 @@ impl Gateway {
     }
 
     /// The queue of frames to a bus was full, so that a frame of ours could not even be handed over.
+    /// To be told before the next [`poll_output`](Self::poll_output): a command whose frame it was is answered "busy".
     pub fn handle_refused(&mut self, now: Now, bus: BusIndex, frame: &CanFrame) {
+        self.refuse_command(bus, frame);
         self.bus_refused(now, bus, frame);
         self.settle(now);
     }
@@ -180,6 +186,9 @@ impl Gateway {
 
     /// What is to be done; call until `None`.
     pub fn poll_output(&mut self) -> Option<Output> {
+        if self.outputs.is_empty() {
+            self.answer_commands();
+        }
         self.outputs.pop_front()
     }
 
@@ -276,13 +285,11 @@ impl Gateway {
     /// The tags of a node, or of one of its TPDOs, can be trusted less.
     pub(super) fn degrade(&mut self, now: Now, node: NodeIndex, pdo: Option<PdoIndex>, quality: Quality) {
         let carrier = pdo.map(CarrierIndex::from);
-        let changed = self.tags.degrade(&self.table, now, node, carrier, quality);
+        self.tags.degrade(&self.table, now, node, carrier, quality);
         self.dirty_nodes.mark(node.0);
-        let Some(node) = self.nodes.get_mut(node.0) else { return };
-        if changed {
-            node.status.generation = node.status.generation.wrapping_add(1);
-        }
-        if !quality.is_usable() {
+        if let Some(node) = self.nodes.get_mut(node.0)
+            && !quality.is_usable()
+        {
             node.lose_data_of(pdo);
         }
     }
@@ -305,6 +312,7 @@ impl Gateway {
         for place in self.changed_nodes.drain() {
             if let Some(node) = self.nodes.get_mut(place) {
                 node.status.data_good = self.tags.all_good(NodeIndex(place));
+                node.status.generation = node.status.generation.wrapping_add(1);
             }
             self.dirty_nodes.mark(place);
         }
@@ -319,7 +327,7 @@ impl Gateway {
 mod tests {
     use super::*;
     use crate::can::{BusCounters, Link};
-    use crate::gateway::fixture;
+    use crate::gateway::{Action, CommandSource, fixture};
     use crate::process_image::{BusState, EventKind, Reason, Value};
 
     /// A gateway with its image; time in milliseconds.
@@ -518,5 +526,119 @@ mod tests {
         bench.publish();
         assert_eq!(bench.image.buses[0].frames_not_sent, 1);
         assert!(bench.events().contains(&"frame_not_sent"));
+    }
+    #[test]
+    fn frames_not_sent_never_become_fewer() {
+        let mut bench = Bench::new(fixture::table());
+        bench.link(0, Link::ErrorActive);
+        let report = |millis, frames_not_sent| BusEvent::Counters {
+            counters: BusCounters { frames_not_sent, ..BusCounters::default() },
+            at: Now::from_millis(millis),
+        };
+        bench.bus(report(1_000, 1));
+        bench.bus(report(1_100, 9));
+        bench.gateway.handle_refused(Now::from_millis(1_200), BUS, &"701#R1".parse().unwrap());
+        bench.publish();
+        assert_eq!(bench.image.buses[0].frames_not_sent, 10);
+        bench.bus(report(1_300, 9));
+        assert_eq!(bench.image.buses[0].frames_not_sent, 10);
+    }
+
+    #[test]
+    fn r_det_089_a_bus_that_was_heard_has_no_wrong_bit_rate() {
+        let mut bench = Bench::new(fixture::table());
+        bench.link(0, Link::ErrorActive);
+        bench.frame(40, "181#3301");
+        bench.link(100, Link::BusOff);
+        let told = bench.image.journal.newest_first().find(|event| event.name == "bus_state").unwrap();
+        assert_eq!(told.text, "");
+    }
+
+    #[test]
+    fn a_command_whose_frame_finds_the_queue_full_is_answered_busy() {
+        let mut bench = Bench::new(fixture::table());
+        bench.link(0, Link::ErrorActive);
+        let action = Action::Nmt { node: ENGINE1, request: crate::canopen::NmtRequest::Stop };
+        let command = Command { id: 3, source: CommandSource::Web("test".into()), action };
+        let now = Now::from_millis(50);
+        bench.gateway.handle_input(now, Input::Command(command));
+        let mut outcomes = Vec::new();
+        while let Some(output) = bench.gateway.poll_output() {
+            match output {
+                Output::Transmit { bus, frame } => bench.gateway.handle_refused(now, bus, &frame),
+                Output::Reply { id, outcome } => outcomes.push((id, outcome)),
+            }
+        }
+        assert_eq!(outcomes, [(3, Outcome::Busy)]);
+        bench.publish();
+        let told = bench.image.journal.newest_first().find(|event| event.kind == EventKind::Command).unwrap();
+        assert_eq!(told.to, "busy");
+    }
+
+    #[test]
+    fn r_dst_037_a_number_that_is_none_is_bad_and_clears_no_alarm() {
+        const PRESSURE: &str = r#"
+            format = 1
+            device = { vendor = "test", model = "pressure" }
+            [tpdo.1]
+            cob_id = "$NODEID+0x180"
+            length = 8
+            period_ms = 100
+            [[tag]]
+            name = "pressure"
+            tpdo = 1
+            bit = 0
+            type = "f32"
+            [[tag]]
+            name = "temperature"
+            tpdo = 1
+            bit = 32
+            type = "i32"
+            [[derived]]
+            name = "margin"
+            margin = { of = "pressure", to = "temperature" }
+            [[alarm]]
+            name = "high"
+            when = "pressure > 5"
+            priority = "high"
+            text = ""
+            action = ""
+        "#;
+        let mut bench = Bench::new(fixture::of(PRESSURE));
+        let alarm = bench.gateway.table.alarms.iter().position(|alarm| alarm.name == "high").unwrap();
+        bench.frame(10, "181#0000C84200000000");
+        assert_eq!(
+            (bench.sample("pressure").value, bench.sample("pressure").quality),
+            (Value::Float(100.0), Quality::Good)
+        );
+        assert!(bench.image.alarms[alarm].state.is_active() && bench.image.nodes[0].data_good);
+        for (millis, none) in [(20, "0000C07F"), (30, "0000807F"), (40, "000080FF")] {
+            bench.frame(millis, &format!("181#{none}07000000"));
+            assert_eq!(bench.sample("pressure").quality.to_string(), "bad (not_a_number)");
+            assert_eq!(bench.sample("margin").quality.to_string(), "bad (not_a_number)");
+            assert!(bench.image.alarms[alarm].state.is_active());
+            assert_eq!(bench.sample("temperature").quality, Quality::Good);
+            assert!(!bench.image.nodes[0].data_good && bench.image.nodes[0].pdos[0].usable);
+        }
+        bench.frame(50, "181#0000000000000000");
+        assert_eq!(bench.sample("pressure").quality, Quality::Good);
+        assert!(!bench.image.alarms[alarm].state.is_active());
+    }
+
+    #[test]
+    fn the_number_of_the_highest_is_that_of_its_name_where_numbers_are_left_out() {
+        let level = |number: u8| {
+            format!("[[tag]]\nname = 'level_{number}'\ntpdo = 1\nbit = {}\ntype = 'u8'\n", 8 * (number / 2))
+        };
+        let levels = [1, 4, 9].map(level).concat();
+        let mapping = format!(
+            "format = 1\ndevice = {{ vendor = 'test', model = 'levels' }}\n[tpdo.1]\ncob_id = '$NODEID+0x180'\n\
+             length = 8\nperiod_ms = 100\n{levels}[[derived]]\nname = 'which'\narg_maximum = 'level_*'\n"
+        );
+        let mut bench = Bench::new(fixture::of(&mapping));
+        for (millis, frame, number) in [(10, "01", 1), (20, "000002", 4), (30, "0000000003", 9)] {
+            bench.frame(millis, &format!("181#{frame:0<16}"));
+            assert_eq!(bench.sample("which").value, Value::Unsigned(number));
+        }
     }
 }

@@ -1,9 +1,11 @@
 //! Derived tags: values computed from other tags of the node, with what they have to remember.
 //!
-//! Quality is the worst of what was looked at, with two refinements. Where candidates have a validity tag, only the
-//! valid ones are looked at, and with none the value is bad (no input). Edges are looked for only in values that can
-//! be used: a bit that goes stale and comes back as it was has no edge. A bit that is already set when it is received
-//! for the first time counts as a rise, so that a latch shows it.
+//! Quality is the worst of what was looked at, with two refinements. Where candidates have a validity tag, those that
+//! are known to be invalid are left out; with none left the value is bad (no input), and the last one stays
+//! (R-DET-084). What is not known to be invalid takes its part: a validity that cannot be used spoils the result
+//! (R-DET-087). Edges are looked for only in values that can be used: a bit that goes stale and comes back as it was
+//! has no edge. A bit that is already set when it is received for the first time counts as a rise, so that a latch
+//! shows it.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -103,11 +105,27 @@ pub(super) fn runs_with_time(derived: &Derived, memory: &Memory, now: Now) -> bo
     }
 }
 
-/// The value of a derived tag now. For [`Derived::RisingEdges`] also the edge of its source, where there was one.
+/// What a derived tag shows before there is anything to compute it from: zero, of the kind that it will be of.
+pub(super) fn nothing(derived: &Derived) -> Value {
+    match derived {
+        Derived::Bit { .. } | Derived::Logic { .. } | Derived::Latch { .. } => Value::Bool(false),
+        Derived::Maximum { .. } | Derived::Margin { .. } | Derived::Constant { .. } => Value::Float(0.0),
+        Derived::Pack { .. }
+        | Derived::ArgMaximum { .. }
+        | Derived::Count { .. }
+        | Derived::RisingEdges { .. }
+        | Derived::SecondsSinceRise { .. }
+        | Derived::EdgesWithin { .. } => Value::Unsigned(0),
+    }
+}
+
+/// The value of a derived tag now; `before` is what it was. For [`Derived::RisingEdges`] also the edge of its source,
+/// where there was one.
 pub(super) fn evaluate(
     now: Now,
     derived: &Derived,
     memory: &mut Memory,
+    before: &Sample,
     tags: &[Sample],
 ) -> (Computed, Option<(TagIndex, bool)>) {
     let computed = match derived {
@@ -124,24 +142,26 @@ pub(super) fn evaluate(
             });
             Computed::plain(Value::Bool(holds), quality)
         }
-        Derived::Maximum { among, valid } => highest(tags, among, valid.as_deref()).map_or_else(
-            |quality| Computed::plain(Value::Float(0.0), quality),
-            |best| Computed { raw: best.sample.raw, value: best.sample.value, quality: best.quality },
-        ),
-        Derived::ArgMaximum { among, valid, first } => {
-            let (number, quality) = match highest(tags, among, valid.as_deref()) {
-                Ok(best) => (place_number(*first, best.place), best.quality),
-                Err(quality) => (0, quality),
-            };
-            Computed::plain(Value::Unsigned(number), quality)
-        }
+        Derived::Maximum { among, valid } => match highest(tags, among, valid.as_deref()) {
+            Ok(best) => Computed { raw: best.sample.raw, value: best.sample.value, quality: best.quality },
+            Err(quality) => Computed { raw: before.raw, value: before.value, quality },
+        },
+        Derived::ArgMaximum { among, valid, numbers } => match highest(tags, among, valid.as_deref()) {
+            Ok(best) => {
+                let number = numbers.get(best.place).copied().map_or(0, u64::from);
+                Computed::plain(Value::Unsigned(number), best.quality)
+            }
+            Err(quality) => Computed::plain(before.value, quality),
+        },
         Derived::Margin { among, valid, limit } => {
             let limit = sample(tags, *limit);
-            let (margin, quality) = match highest(tags, among, valid.as_deref()) {
-                Ok(best) => (limit.value.as_f64() - best.sample.value.as_f64(), best.quality),
-                Err(quality) => (0.0, quality),
-            };
-            Computed::plain(Value::Float(margin), quality.worst(limit.quality))
+            match highest(tags, among, valid.as_deref()) {
+                Ok(best) => {
+                    let margin = limit.value.as_f64() - best.sample.value.as_f64();
+                    Computed::plain(Value::Float(margin), best.quality.worst(limit.quality))
+                }
+                Err(quality) => Computed::plain(before.value, quality.worst(limit.quality)),
+            }
         }
         Derived::Count { of } => count(tags, of),
         Derived::RisingEdges { of } => {
@@ -176,10 +196,6 @@ fn sample(tags: &[Sample], tag: TagIndex) -> &Sample {
     tags.get(tag.0).unwrap_or(&Sample::NEVER)
 }
 
-fn place_number(first: u16, place: usize) -> u64 {
-    u64::from(first).saturating_add(u64::try_from(place).unwrap_or(u64::MAX))
-}
-
 fn pack(tags: &[Sample], of: &[TagIndex]) -> Computed {
     let (bits, quality) = of.iter().rev().fold((0_u64, Quality::Good), |(bits, quality), tag| {
         let source = sample(tags, *tag);
@@ -212,24 +228,23 @@ fn highest<'a>(
     valid: Option<&[TagIndex]>,
 ) -> Result<Best<'a>, Quality> {
     let mut best: Option<Best<'a>> = None;
-    let mut unknown = Quality::Good;
-    let mut some_known = false;
+    // The worst of what tells which of them are valid: one that cannot be used may leave out the wrong ones.
+    let mut validity = Quality::Good;
     for (place, tag) in among.iter().enumerate() {
         let candidate = sample(tags, *tag);
-        let mut quality = candidate.quality;
-        if let Some(validity) = valid.and_then(|valid| valid.get(place)) {
-            let validity = sample(tags, *validity);
-            if !validity.value.is_true() {
-                some_known |= validity.quality.is_usable();
-                unknown = unknown.worst(validity.quality);
+        if let Some(tells) = valid.and_then(|valid| valid.get(place)) {
+            let tells = sample(tags, *tells);
+            if !tells.quality.is_usable() || tells.value.is_true() {
+                validity = validity.worst(tells.quality);
+            }
+            if !tells.value.is_true() {
                 continue;
             }
-            quality = quality.worst(validity.quality);
         }
         best = Some(match best {
-            None => Best { place, sample: candidate, quality },
+            None => Best { place, sample: candidate, quality: candidate.quality },
             Some(so_far) => {
-                let quality = so_far.quality.worst(quality);
+                let quality = so_far.quality.worst(candidate.quality);
                 let (old, new) = (so_far.sample.value.as_f64(), candidate.value.as_f64());
                 if new > old || (old.is_nan() && !new.is_nan()) {
                     Best { place, sample: candidate, quality }
@@ -239,7 +254,8 @@ fn highest<'a>(
             }
         });
     }
-    best.ok_or(if some_known || unknown.is_usable() { Quality::Bad(Reason::NoInput) } else { unknown })
+    let why = if validity.is_usable() { Quality::Bad(Reason::NoInput) } else { validity };
+    best.map(|best| Best { quality: best.quality.worst(validity), ..best }).ok_or(why)
 }
 
 #[cfg(test)]
@@ -268,7 +284,8 @@ mod tests {
     }
 
     fn once(derived: &Derived, tags: &[Sample]) -> (Value, Quality) {
-        let (computed, _) = evaluate(Now::from_millis(0), derived, &mut Memory::default(), tags);
+        let before = Sample { value: nothing(derived), ..Sample::NEVER };
+        let (computed, _) = evaluate(Now::from_millis(0), derived, &mut Memory::default(), &before, tags);
         (computed.value, computed.quality)
     }
 
@@ -304,8 +321,9 @@ mod tests {
         let (among, valid) = (indexes(0..3), Some(indexes(3..6)));
         let maximum = Derived::Maximum { among: among.clone(), valid: valid.clone() };
         assert_eq!(once(&maximum, &tags), (Value::Float(3.0), Quality::Good));
-        let which = Derived::ArgMaximum { among: among.clone(), valid: valid.clone(), first: 1 };
-        assert_eq!(once(&which, &tags), (Value::Unsigned(1), Quality::Good), "the first among equals");
+        let which =
+            Derived::ArgMaximum { among: among.clone(), valid: valid.clone(), numbers: vec![4, 5, 9] };
+        assert_eq!(once(&which, &tags), (Value::Unsigned(4), Quality::Good), "the first among equals");
         let margin = Derived::Margin { among, valid, limit: TagIndex(6) };
         assert_eq!(once(&margin, &tags), (Value::Float(7.0), Quality::Good));
     }
@@ -313,17 +331,36 @@ mod tests {
     #[test]
     fn a_candidate_that_is_left_out_does_not_spoil_the_quality_and_a_valid_one_does() {
         let derived = Derived::Maximum { among: indexes(0..2), valid: Some(indexes(2..4)) };
-        let left_out = [number(3.0), with(STALE, number(9.0)), bit(true), Sample::NEVER];
+        let left_out = [number(3.0), with(STALE, number(9.0)), bit(true), bit(false)];
         assert_eq!(once(&derived, &left_out), (Value::Float(3.0), Quality::Good));
         let valid = [number(3.0), with(STALE, number(1.0)), bit(true), bit(true)];
         assert_eq!(once(&derived, &valid), (Value::Float(3.0), STALE));
     }
 
     #[test]
-    fn with_no_valid_candidate_the_value_is_bad_and_says_why() {
+    fn r_det_087_an_unknown_validity_spoils_the_quality() {
+        let derived = Derived::Maximum { among: indexes(0..2), valid: Some(indexes(2..4)) };
+        let values = [number(3.0), number(9.0)];
+        for (validity, quality) in [
+            (Sample::NEVER, Quality::NEVER),
+            (with(STALE, bit(false)), STALE),
+            (with(Quality::Uncertain(Reason::NodeLost), bit(false)), Quality::Good),
+        ] {
+            let tags = [values[0], values[1], bit(true), validity];
+            assert_eq!(once(&derived, &tags), (Value::Float(3.0), quality));
+        }
+        let believed = [values[0], values[1], bit(true), with(STALE, bit(true))];
+        assert_eq!(once(&derived, &believed), (Value::Float(9.0), STALE), "valid when it was known last");
+    }
+
+    #[test]
+    fn with_no_valid_candidate_the_value_is_bad_says_why_and_the_last_one_stays() {
         let derived = Derived::Maximum { among: indexes(0..1), valid: Some(indexes(1..2)) };
         assert_eq!(once(&derived, &[number(3.0), bit(false)]), (Value::Float(0.0), NO_INPUT));
         assert_eq!(once(&derived, &[number(3.0), Sample::NEVER]), (Value::Float(0.0), Quality::NEVER));
+        let (before, tags) = (number(7.0), [number(3.0), bit(false)]);
+        let (computed, _) = evaluate(Now::from_millis(0), &derived, &mut Memory::default(), &before, &tags);
+        assert_eq!((computed.value, computed.quality), (Value::Float(7.0), NO_INPUT));
     }
 
     #[test]
@@ -343,7 +380,9 @@ mod tests {
                 last = level.unwrap_or(last);
                 let quality = if level.is_some() { Quality::Good } else { STALE };
                 let tags = [with(quality, bit(last))];
-                evaluate(Now::from_millis(second * 1_000), derived, &mut memory, &tags).0.value
+                evaluate(Now::from_millis(second * 1_000), derived, &mut memory, &Sample::NEVER, &tags)
+                    .0
+                    .value
             })
             .collect()
     }
@@ -361,7 +400,8 @@ mod tests {
     fn the_count_of_rises_wraps_at_16_bit() {
         let mut memory = Memory { rises: u16::MAX, ..Memory::default() };
         let derived = Derived::RisingEdges { of: TagIndex(0) };
-        let (computed, edge) = evaluate(Now::from_millis(0), &derived, &mut memory, &[bit(true)]);
+        let (computed, edge) =
+            evaluate(Now::from_millis(0), &derived, &mut memory, &Sample::NEVER, &[bit(true)]);
         assert_eq!((computed.value, edge), (Value::Unsigned(0), Some((TagIndex(0), true))));
     }
 
@@ -371,7 +411,7 @@ mod tests {
         assert_eq!(run(&derived, &[Some(false)]), [Value::Unsigned(65_535)]);
         assert_eq!(run(&derived, &PULSES), [0, 1, 2, 3, 4, 0, 1].map(Value::Unsigned));
         let mut memory = Memory::default();
-        evaluate(Now::from_millis(0), &derived, &mut memory, &[bit(true)]);
+        evaluate(Now::from_millis(0), &derived, &mut memory, &Sample::NEVER, &[bit(true)]);
         assert!(runs_with_time(&derived, &memory, Now::from_millis(65_534_999)));
         assert!(!runs_with_time(&derived, &memory, Now::from_millis(65_535_000)));
     }
@@ -381,7 +421,7 @@ mod tests {
         let derived = Derived::Latch { of: TagIndex(0) };
         let mut memory = Memory::default();
         let value = |memory: &mut Memory, level| {
-            evaluate(Now::from_millis(0), &derived, memory, &[bit(level)]).0.value
+            evaluate(Now::from_millis(0), &derived, memory, &Sample::NEVER, &[bit(level)]).0.value
         };
         assert_eq!(value(&mut memory, false), Value::Bool(false));
         assert_eq!(value(&mut memory, true), Value::Bool(true));

@@ -4,18 +4,37 @@ use super::core::{Gateway, Output};
 use super::node_event::request_word;
 use super::{Action, Command, CommandSource, Outcome};
 use crate::alarms::AcknowledgeError;
-use crate::canopen::{NmtRequest, Role};
+use crate::can::{BusIndex, CanFrame};
+use crate::canopen::{NmtRequest, Role, cob_id};
 use crate::mapping::AlarmOwner;
 use crate::process_image::{AlarmIndex, NodeIndex};
 use crate::time::Now;
 
+/// A command that has been dealt with but for its answer.
+#[derive(Debug)]
+pub(super) struct Finished {
+    id: u64,
+    at: Now,
+    source: CommandSource,
+    /// Its word in the journal.
+    name: &'static str,
+    about: AlarmOwner,
+    /// What was asked for, in words.
+    what: String,
+    outcome: Outcome,
+    /// The frame that does it: if the bus does not even take it, nothing was done.
+    frame: Option<(BusIndex, CanFrame)>,
+}
+
 impl Gateway {
-    /// Does what is asked for, if it is allowed; the journal tells who asked and what came of it.
+    /// Does what is asked for, if it is allowed. The answer, and the line in the journal that tells who asked and what
+    /// came of it, follow when its frame was handed over: see [`Gateway::answer_commands`].
     pub(super) fn command(&mut self, now: Now, command: Command) {
         let Command { id, source, action } = command;
+        let mut frame = None;
         let (name, about, outcome, what) = match action {
             Action::Nmt { node, request } => {
-                let outcome = self.request_nmt(now, node, request);
+                let outcome = self.request_nmt(now, node, request, &mut frame);
                 ("nmt", self.owner_of_node(node), outcome, request_word(request).to_owned())
             }
             Action::Acknowledge { alarm } => {
@@ -44,20 +63,44 @@ impl Gateway {
                 ("reset", self.owner_of_alarm(alarm), outcome, self.name_of_alarm(alarm))
             }
         };
-        self.events.record_command(now, about, name, |event| {
-            event.from = source_text(&source);
-            outcome_word(&outcome).clone_into(&mut event.to);
-            event.text = match &outcome {
-                Outcome::Rejected(reason) if what.is_empty() => reason.clone(),
-                Outcome::Rejected(reason) => format!("{what}: {reason}"),
-                Outcome::Done | Outcome::Unknown | Outcome::Busy | Outcome::NodeUnavailable => what,
-            };
-        });
-        self.outputs.push_back(Output::Reply { id, outcome });
+        self.finished.push(Finished { id, at: now, source, name, about, what, outcome, frame });
         self.settle(now);
     }
 
-    fn request_nmt(&mut self, now: Now, node: NodeIndex, request: NmtRequest) -> Outcome {
+    /// The bus did not take a frame: the command that it was for failed.
+    pub(super) fn refuse_command(&mut self, bus: BusIndex, frame: &CanFrame) {
+        for command in &mut self.finished {
+            if command.frame == Some((bus, *frame)) {
+                command.outcome = Outcome::Busy;
+            }
+        }
+    }
+
+    /// Answers the commands that were dealt with. To be called when everything else was handed over.
+    pub(super) fn answer_commands(&mut self) {
+        for command in std::mem::take(&mut self.finished) {
+            let Finished { id, at, source, name, about, what, outcome, .. } = command;
+            self.events.record_command(at, about, name, |event| {
+                event.from = source_text(&source);
+                outcome_word(&outcome).clone_into(&mut event.to);
+                event.text = match &outcome {
+                    Outcome::Rejected(reason) if what.is_empty() => reason.clone(),
+                    Outcome::Rejected(reason) => format!("{what}: {reason}"),
+                    Outcome::Done | Outcome::Unknown | Outcome::Busy | Outcome::NodeUnavailable => what,
+                };
+            });
+            self.outputs.push_back(Output::Reply { id, outcome });
+        }
+    }
+
+    /// `frame` becomes the one that carries the command.
+    fn request_nmt(
+        &mut self,
+        now: Now,
+        node: NodeIndex,
+        request: NmtRequest,
+        frame: &mut Option<(BusIndex, CanFrame)>,
+    ) -> Outcome {
         let Some(def) = self.table.nodes.get(node.0) else { return Outcome::Unknown };
         let Some(bus_def) = self.table.buses.get(def.bus.0) else { return Outcome::Unknown };
         let (id, index) = (def.canopen.id, def.bus);
@@ -72,7 +115,12 @@ impl Gateway {
             return Outcome::NodeUnavailable;
         }
         let accepted = bus.network.request_nmt(now, Some(id), request);
+        let before = self.outputs.len();
         self.drain_network(now, index);
+        *frame = self.outputs.iter().skip(before).find_map(|output| match output {
+            Output::Transmit { bus, frame } if frame.id() == cob_id::NMT => Some((*bus, *frame)),
+            Output::Transmit { .. } | Output::Reply { .. } => None,
+        });
         if accepted { Outcome::Done } else { Outcome::Rejected("the network does not allow it".into()) }
     }
 
@@ -82,12 +130,10 @@ impl Gateway {
             return Outcome::Unknown;
         }
         let of = node.map(AlarmOwner::Node);
-        for (place, alarm) in self.table.alarms.iter().enumerate() {
-            if of.is_none_or(|of| of == alarm.owner) {
-                // That most alarms wait for nothing is no fault of this request.
-                let _ = self.conditions.list_mut().acknowledge(now, AlarmIndex(place));
-            }
-        }
+        let alarms = self.table.alarms.iter().enumerate();
+        let concerned = alarms.filter(|(_, alarm)| of.is_none_or(|of| of == alarm.owner));
+        // That most alarms wait for nothing is no fault of this request.
+        self.conditions.list_mut().acknowledge_all(now, concerned.map(|(place, _)| AlarmIndex(place)));
         self.tags.acknowledge_latches(&self.table, now, node);
         Outcome::Done
     }

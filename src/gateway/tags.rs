@@ -116,7 +116,7 @@ impl Tags {
         &self.state.samples
     }
 
-    /// Takes new data of a carrier: its tags, and all that is computed from them. Whether a value or a quality changed.
+    /// Takes new data of a carrier: its tags, and all that is computed from them.
     pub(super) fn apply(
         &mut self,
         table: &TagTable,
@@ -124,25 +124,24 @@ impl Tags {
         (node, carrier): (NodeIndex, CarrierIndex),
         data: &[u8],
         quality: Quality,
-    ) -> bool {
+    ) {
         let Self { layout, state } = self;
         let node = layout.nodes.get(node.0);
-        let Some(carrier) = node.and_then(|node| node.carriers.get(carrier.0)) else { return false };
-        let mut changed = false;
+        let Some(carrier) = node.and_then(|node| node.carriers.get(carrier.0)) else { return };
         for Placed { tag, field, scale } in &carrier.placed {
             let Some(raw) = codec::decode(field, data) else { continue };
             let value = scale.as_ref().map_or(raw, |scale| codec::scale(scale, raw));
-            changed |= state.store(layout, *tag, raw, value, quality);
+            state.store(layout, *tag, raw, value, quality_of(value, quality));
             state.receive(*tag, now);
         }
         for tag in &carrier.computed {
             state.receive(*tag, now);
         }
-        changed | state.compute_outdated(table, layout, &carrier.computed, now)
+        state.compute_outdated(table, layout, &carrier.computed, now);
     }
 
     /// The tags of a node, or of one of its carriers, can be trusted less from now on. A quality never gets better this
-    /// way: only newly received data makes a tag good again (R-DET-037). Whether anything changed.
+    /// way: only newly received data makes a tag good again (R-DET-037).
     pub(super) fn degrade(
         &mut self,
         table: &TagTable,
@@ -150,18 +149,17 @@ impl Tags {
         node: NodeIndex,
         carrier: Option<CarrierIndex>,
         quality: Quality,
-    ) -> bool {
+    ) {
         let Self { layout, state } = self;
-        let Some(node) = layout.nodes.get(node.0) else { return false };
+        let Some(node) = layout.nodes.get(node.0) else { return };
         let carriers = node.carriers.iter().enumerate();
         let of = carriers.filter(|(place, _)| carrier.is_none_or(|carrier| carrier.0 == *place));
-        let mut changed = false;
         for placed in of.flat_map(|(_, carrier)| &carrier.placed) {
             let Some(sample) = state.samples.get(placed.tag.0).copied() else { continue };
             let worse = degraded(sample.quality, quality);
-            changed |= state.store(layout, placed.tag, sample.raw, sample.value, worse);
+            state.store(layout, placed.tag, sample.raw, sample.value, worse);
         }
-        changed | state.compute_outdated(table, layout, &node.derived, now)
+        state.compute_outdated(table, layout, &node.derived, now);
     }
 
     /// Whether all that a node's device sends is good: each tag that stands in one of its carriers.
@@ -301,12 +299,12 @@ fn computed_from(tags: impl Iterator<Item = TagIndex>, dependents: &[Vec<TagInde
 }
 
 impl State {
-    /// Whether value or quality is another than before; then all that is computed from it is outdated.
-    fn store(&mut self, layout: &Layout, tag: TagIndex, raw: Value, value: Value, quality: Quality) -> bool {
-        let Some(sample) = self.samples.get_mut(tag.0) else { return false };
+    /// Where value or quality is another than before, all that is computed from it is outdated.
+    fn store(&mut self, layout: &Layout, tag: TagIndex, raw: Value, value: Value, quality: Quality) {
+        let Some(sample) = self.samples.get_mut(tag.0) else { return };
         let new = Sample { raw, value, quality, ..*sample };
         if same(&new, sample) {
-            return false;
+            return;
         }
         *sample = new;
         self.unpublished.mark(tag.0);
@@ -316,7 +314,6 @@ impl State {
                 *outdated = true;
             }
         }
-        true
     }
 
     /// New data came for the tag.
@@ -330,34 +327,36 @@ impl State {
 
     /// Computes those of some derived tags of which an input has changed. Inputs are to come before what is computed
     /// from them, as in the table.
-    fn compute_outdated(
-        &mut self,
-        table: &TagTable,
-        layout: &Layout,
-        derived: &[TagIndex],
-        now: Now,
-    ) -> bool {
-        let mut changed = false;
+    fn compute_outdated(&mut self, table: &TagTable, layout: &Layout, derived: &[TagIndex], now: Now) {
         for tag in derived {
             let outdated = self.outdated.get_mut(tag.0).is_some_and(std::mem::take);
             if outdated {
-                changed |= self.compute(table, layout, *tag, now);
+                self.compute(table, layout, *tag, now);
             }
         }
-        changed
     }
 
-    fn compute(&mut self, table: &TagTable, layout: &Layout, tag: TagIndex, now: Now) -> bool {
-        let Some(Source::Derived(derived)) = table.tag(tag).map(|tag| &tag.source) else { return false };
-        let Some(memory) = self.memories.get_mut(tag.0) else { return false };
-        let (computed, edge) = derived::evaluate(now, derived, memory, &self.samples);
+    fn compute(&mut self, table: &TagTable, layout: &Layout, tag: TagIndex, now: Now) {
+        let Some(Source::Derived(derived)) = table.tag(tag).map(|tag| &tag.source) else { return };
+        let Some(memory) = self.memories.get_mut(tag.0) else { return };
+        let Some(before) = self.samples.get(tag.0) else { return };
+        let (computed, edge) = derived::evaluate(now, derived, memory, before, &self.samples);
         if derived::runs_with_time(derived, memory, now) {
             self.running.mark(tag.0);
             let next = Instant::from_millis((now.instant.as_millis() / 1_000 + 1) * 1_000);
             self.next_second = Some(self.next_second.map_or(next, |due| due.min(next)));
         }
         self.edges.extend(edge);
-        self.store(layout, tag, computed.raw, computed.value, computed.quality)
+        let quality = quality_of(computed.value, computed.quality);
+        self.store(layout, tag, computed.raw, computed.value, quality);
+    }
+}
+
+/// The quality of a value that came with some quality: one that is no number cannot be used (R-DST-037).
+fn quality_of(value: Value, quality: Quality) -> Quality {
+    match value {
+        Value::Float(number) if !number.is_finite() => quality.worst(Quality::Bad(Reason::NotANumber)),
+        Value::Float(_) | Value::Bool(_) | Value::Unsigned(_) | Value::Signed(_) => quality,
     }
 }
 
@@ -420,7 +419,7 @@ fn never_received(source: &Source) -> Sample {
             };
             (raw, *scale)
         }
-        Source::Derived(_) => (Value::Unsigned(0), Scale::IDENTITY),
+        Source::Derived(derived) => (derived::nothing(derived), Scale::IDENTITY),
     };
     let value = codec::scale(&scale, raw);
     // What the offset of a scale makes of a zero was never measured.

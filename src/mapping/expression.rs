@@ -134,8 +134,10 @@ impl Operand {
 }
 
 impl Comparison {
+    /// Whether it holds of two numbers; with NaN it never does.
+    #[must_use]
     #[expect(clippy::float_cmp, reason = "`==` in a mapping means equal, as its manual says")]
-    fn holds(self, left: f64, right: f64) -> bool {
+    pub fn holds(self, left: f64, right: f64) -> bool {
         match self {
             Self::Less => left < right,
             Self::LessOrEqual => left <= right,

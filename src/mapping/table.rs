@@ -253,14 +253,14 @@ pub enum Derived {
         /// Their validity.
         valid: Option<Vec<TagIndex>>,
     },
-    /// Which candidate is highest: its place, counted from `first`; the lowest place among equals.
+    /// Which candidate is highest: its number; that of the first among equals.
     ArgMaximum {
         /// Candidates.
         among: Vec<TagIndex>,
         /// Their validity.
         valid: Option<Vec<TagIndex>>,
-        /// Number of the first candidate.
-        first: u16,
+        /// Their numbers, one for each.
+        numbers: Vec<u16>,
     },
     /// The smallest distance up to a limit, `limit - value`; negative above it.
     Margin {

@@ -34,6 +34,8 @@ pub enum Reason {
     DuplicateNode,
     /// Computed from values of which none is usable.
     NoInput,
+    /// The device sends NaN or infinity (R-DST-037).
+    NotANumber,
 }
 
 impl Quality {
@@ -92,6 +94,7 @@ impl Reason {
             Self::BusUnavailable => "bus_unavailable",
             Self::DuplicateNode => "duplicate_node",
             Self::NoInput => "no_input",
+            Self::NotANumber => "not_a_number",
         }
     }
 }

@@ -302,3 +302,15 @@ fn a_storm_cannot_flush_the_journal() {
     assert_eq!(conversation.events_named("emergency").len(), 1, "still there");
     assert!(conversation.image.journal.newest() < 100);
 }
+
+#[test]
+fn a_count_is_at_least_what_is_known_of_it() {
+    let mut conversation = detcon();
+    conversation.answer_guarding(1, 5);
+    for frame in [QUIET[0], QUIET[1], "381#0000FF0F03000000"] {
+        conversation.send_cyclically(frame, 500);
+    }
+    conversation.run_to(3_000);
+    assert_eq!(conversation.tag_text("sensor_faults"), "2 bad (never_received)");
+    assert!(conversation.active().contains(&"protection_degraded"), "{:?}", conversation.active());
+}

@@ -1,6 +1,7 @@
 //! TPDOs and what becomes of them: V-DET-04..13, 16..19, and qualities.
 
 use cangate::can::{BusEvent, Link};
+use cangate::gateway::Action;
 use cangate::process_image::{Quality, Reason, Value};
 use cangate::time::Now;
 
@@ -343,4 +344,54 @@ fn a_clock_that_steps_fires_no_timeout() {
     assert_eq!(conversation.tag_text("knock_intensity_1"), "20.00 good");
     conversation.run_to(1_600);
     assert_eq!(conversation.tag("knock_intensity_1").quality.reason(), None::<Reason>);
+}
+
+#[test]
+fn r_det_087_a_maximum_over_channels_of_which_nothing_is_known_is_not_good() {
+    let mut conversation = after("381#0080FF0F000099CC");
+    conversation.frame("181#3300000000000000");
+    conversation.frame("281#0000000000000000");
+    assert_eq!(conversation.tag_text("knock_intensity_max"), "20.00 bad (never_received)");
+    conversation.frame("481#000000000000");
+    assert_eq!(conversation.tag_text("knock_intensity_max"), "20.00 good");
+}
+
+#[test]
+fn r_det_084_a_maximum_without_a_valid_channel_keeps_its_last_value() {
+    let mut conversation = running(detcon());
+    conversation.frame("181#0033000000000000");
+    assert_eq!(conversation.tag_text("knock_intensity_max"), "20.00 good");
+    conversation.frame("381#0000000000009900");
+    assert_eq!(conversation.tag_text("knock_intensity_max"), "20.00 bad (no_input)");
+    assert_eq!(conversation.tag_text("knock_intensity_max_channel"), "2 bad (no_input)");
+    assert_eq!(conversation.tag_text("reduction_margin_min"), "40.00 bad (no_input)");
+}
+
+#[test]
+fn r_det_081_a_tpdo_that_is_always_too_long_is_warned_of_once() {
+    let mut conversation = running(detcon());
+    conversation.stop_sending("481");
+    conversation.send_cyclically("481#0000000000000000", 500);
+    conversation.run_to(30_000);
+    assert_eq!(conversation.active(), ["pdo_length"]);
+    conversation.run_to(600_000);
+    assert_eq!(conversation.active(), [""; 0]);
+    assert_eq!(conversation.raised(), ["pdo_length"]);
+    assert_eq!(conversation.tag_text("knock_intensity_17"), "0.00 good");
+}
+
+#[test]
+fn the_generation_counts_changes_that_come_with_mere_time_and_with_an_acknowledgement() {
+    let mut conversation = running(detcon());
+    conversation.frame("381#0200FF0F000099CC");
+    conversation.frame("381#0000FF0F000099CC");
+    conversation.run_to(5_100);
+    let before = conversation.node().generation;
+    conversation.run_to(6_100);
+    assert_eq!(conversation.tag_text("trip_age"), "5 good");
+    assert!(conversation.node().generation > before, "its age is another");
+    let before = conversation.node().generation;
+    conversation.command(Action::AcknowledgeAll { node: None });
+    assert_eq!(conversation.tag_text("trip_latched"), "false good");
+    assert_eq!(conversation.node().generation, before + 1);
 }

@@ -8,7 +8,7 @@ use super::super::file::DerivedSection;
 use super::super::file_values::NameList;
 use super::super::table::Derived;
 use super::super::{At, Expression, SourceText};
-use super::items::{Element, Item};
+use super::items::{Element, Found, Item};
 use super::problems::Problems;
 use super::tags::{Context, Kind};
 use crate::process_image::TagIndex;
@@ -86,7 +86,7 @@ fn one_way(
         return self::bit(problems, context, &bit.of, &bit.bit, element);
     }
     if let Some(list) = &section.pack {
-        let of = bools(problems, context, list, element);
+        let of = indexes(bools(problems, context, list, element));
         if of.len() > 64 {
             problems.error(
                 context.source,
@@ -101,7 +101,7 @@ fn one_way(
         return condition(problems, context, when, element).map(|when| Derived::Logic { when });
     }
     if let Some(list) = &section.count {
-        return Some(Derived::Count { of: bools(problems, context, list, element) });
+        return Some(Derived::Count { of: indexes(bools(problems, context, list, element)) });
     }
     let bool_tag = |problems: &mut Problems, name: &At<String>, what: &str| {
         context.bool_tag(problems, name, element, what)
@@ -131,34 +131,61 @@ fn compared(
 ) -> Option<Derived> {
     let of = section.margin.as_ref().map(|margin| &margin.of);
     let list = section.maximum.as_ref().or(section.arg_maximum.as_ref()).or(of)?;
-    let (among, first) = context.items.find_all(problems, context.source, list, &item.element);
-    for index in &among {
+    let found = context.items.find_all(problems, context.source, list, &item.element);
+    for index in &found.items {
         number(problems, context, *index, &list.span);
     }
-    let among: Vec<TagIndex> = among.into_iter().map(TagIndex).collect();
     let valid = section.only_where.as_ref().map(|names| {
         let valid = bools(problems, context, names, &item.element);
-        if valid.len() != among.len() && !valid.is_empty() && !among.is_empty() {
-            let message = format!("{} values, but {} tags in `where`", among.len(), valid.len());
-            problems.error(
-                context.source,
-                &names.span,
-                message,
-                "give one bool tag for each value, in the same order",
-            );
-        }
-        valid
+        check_pairs(problems, context, names, &found, &valid);
+        indexes(valid)
     });
+    let numbers = found.numbers.clone();
+    let among = indexes(found);
     if section.maximum.is_some() {
         return Some(Derived::Maximum { among, valid });
     }
     let Some(margin) = &section.margin else {
-        return Some(Derived::ArgMaximum { among, valid, first: u16::try_from(first).unwrap_or(u16::MAX) });
+        let numbers = numbers.unwrap_or_else(|| (1..).take(among.len()).collect());
+        let numbers = numbers.into_iter().map(|number| u16::try_from(number).unwrap_or(u16::MAX)).collect();
+        return Some(Derived::ArgMaximum { among, valid, numbers });
     };
     let limit = item.element.fill(&margin.to.value);
     let limit = context.items.find(problems, context.source, &limit, &margin.to.span)?;
     number(problems, context, limit, &margin.to.span);
     Some(Derived::Margin { among, valid, limit: TagIndex(limit) })
+}
+
+fn indexes(found: Found) -> Vec<TagIndex> {
+    found.items.into_iter().map(TagIndex).collect()
+}
+
+/// Each value needs a tag that tells whether it takes part: that of the same number where both lists have numbers, else
+/// that of the same place.
+fn check_pairs(
+    problems: &mut Problems,
+    context: &Context<'_>,
+    names: &At<NameList>,
+    values: &Found,
+    valid: &Found,
+) {
+    if values.items.is_empty() || valid.items.is_empty() {
+        return;
+    }
+    if let (Some(numbers), Some(there)) = (&values.numbers, &valid.numbers)
+        && let Some(alone) = numbers.iter().position(|number| !there.contains(number))
+        && let Some(item) = values.items.get(alone).and_then(|index| context.items.get(*index))
+    {
+        let there: Vec<String> = there.iter().map(u64::to_string).collect();
+        let message =
+            format!("`{}` has no tag in `where`: those there are numbered {}", item.name, there.join(", "));
+        let hint = "give both the same numbers, or list the tags one by one in the same order";
+        problems.error(context.source, &names.span, message, hint);
+    } else if values.items.len() != valid.items.len() {
+        let message = format!("{} values, but {} tags in `where`", values.items.len(), valid.items.len());
+        let hint = "give one bool tag for each value, in the same order";
+        problems.error(context.source, &names.span, message, hint);
+    }
 }
 
 fn number(problems: &mut Problems, context: &Context<'_>, index: usize, span: &Range<usize>) {
@@ -173,21 +200,16 @@ fn number(problems: &mut Problems, context: &Context<'_>, index: usize, span: &R
     }
 }
 
-fn bools(
-    problems: &mut Problems,
-    context: &Context<'_>,
-    names: &At<NameList>,
-    element: &Element,
-) -> Vec<TagIndex> {
-    let (found, _) = context.items.find_all(problems, context.source, names, element);
-    for index in &found {
+fn bools(problems: &mut Problems, context: &Context<'_>, names: &At<NameList>, element: &Element) -> Found {
+    let found = context.items.find_all(problems, context.source, names, element);
+    for index in &found.items {
         if let (false, Some(item)) = (context.kind(*index) == Kind::Bool, context.items.get(*index)) {
             let message = format!("`{}` is a number, but bool tags are needed here", item.name);
             let hint = "name bool tags; make one of a number with `when = \"tag > 5\"`";
             problems.error(context.source, &names.span, message, hint);
         }
     }
-    found.into_iter().map(TagIndex).collect()
+    found
 }
 
 fn bit(

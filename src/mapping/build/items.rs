@@ -75,6 +75,14 @@ pub fn elements(
     }
 }
 
+/// `bit_stride` is for what has bits in a TPDO.
+pub fn refuse_stride(problems: &mut Problems, source: &SourceText, array: Option<&At<ArraySection>>) {
+    if let Some(stride) = array.and_then(|array| array.value.bit_stride.as_ref()) {
+        let hint = "it is for tags of a TPDO; leave it out";
+        problems.error(source, &stride.span, "`bit_stride` means nothing here", hint);
+    }
+}
+
 /// One tag as it stands in the file.
 #[derive(Clone, Copy, Debug)]
 pub enum Entry<'a> {
@@ -97,6 +105,15 @@ pub struct Item<'a> {
     pub element: Element,
     /// Its entry.
     pub entry: Entry<'a>,
+}
+
+/// Tags that a list names.
+#[derive(Clone, Debug, Default)]
+pub struct Found {
+    /// Their places among the items.
+    pub items: Vec<usize>,
+    /// Their numbers, where the list is one pattern: what its `*` stands for.
+    pub numbers: Option<Vec<u64>>,
 }
 
 /// All tags of a mapping, in the order of the file: parameters, tags, derived tags.
@@ -128,6 +145,9 @@ impl<'a> Items<'a> {
             .map(|section| (&section.name, section.array.as_ref(), Entry::Derived(section)));
         for (name, array, entry) in parameters.chain(tags).chain(derived) {
             let elements = elements(problems, source, name, array);
+            if matches!(entry, Entry::Derived(_)) {
+                refuse_stride(problems, source, array);
+            }
             if elements.is_empty() {
                 items.lost.push(name.value.clone());
             }
@@ -194,25 +214,25 @@ impl<'a> Items<'a> {
         })
     }
 
-    /// The places of several tags, and the number of the first: that which `*` stands for, else 1.
+    /// The places of several tags.
     pub fn find_all(
         &self,
         problems: &mut Problems,
         source: &SourceText,
         names: &At<NameList>,
         element: &Element,
-    ) -> (Vec<usize>, u64) {
+    ) -> Found {
         let list: Vec<(String, &Range<usize>)> = match &names.value {
             NameList::One(name) => vec![(element.fill(name), &names.span)],
             NameList::Several(names) => {
                 names.iter().map(|name| (element.fill(&name.value), &name.span)).collect()
             }
         };
-        let mut found = Vec::new();
-        let mut first = None;
+        let only_one = list.len() == 1;
+        let mut found = Found::default();
         for (pattern, span) in list {
             if !pattern.contains('*') {
-                found.extend(self.find(problems, source, &pattern, span));
+                found.items.extend(self.find(problems, source, &pattern, span));
                 continue;
             }
             let mut matches: Vec<(u64, usize)> = self
@@ -225,10 +245,12 @@ impl<'a> Items<'a> {
                 let hint = "a * stands for a number: `level_*` means level_1, level_2 and so on";
                 problems.error(source, span, format!("no tag matches `{pattern}`"), hint);
             }
-            first = first.or(matches.first().map(|(number, _)| *number));
-            found.extend(matches.into_iter().map(|(_, index)| index));
+            if only_one {
+                found.numbers = Some(matches.iter().map(|(number, _)| *number).collect());
+            }
+            found.items.extend(matches.into_iter().map(|(_, index)| index));
         }
-        (found, first.unwrap_or(1))
+        found
     }
 
     /// A tag.
