@@ -780,6 +780,7 @@ fast_while = "on"
 [tpdo.1]
 cob_id = "$NODEID+0x180"
 length = 4
+period_ms = 100
 reserved_bits = [[20, 2]]
 [[parameter]]
 name = "most"
@@ -857,5 +858,89 @@ fn no_mutated_configuration_makes_the_program_panic_and_every_problem_has_its_pl
         if let Err(problems) = config::load(&source, [], &mut |_| Ok(SMALL.to_owned())) {
             assert_placed(&problems, &text);
         }
+    }
+}
+
+/// A mapping with two TPDOs, and what stands under their heads and after them.
+fn two_tpdos(first: &str, second: &str, rest: &str) -> SourceText {
+    let text = format!(
+        "format = 1\ndevice = {{ vendor = 'x', model = 'y' }}\n{rest}\n[tpdo.1]\ncob_id = '$NODEID+0x180'\n\
+         length = 8\n{first}\n[tpdo.2]\ncob_id = '$NODEID+0x280'\nlength = 8\n{second}\n"
+    );
+    SourceText::new("own.toml", text)
+}
+
+#[test]
+fn a_tpdo_of_which_nobody_would_notice_the_end_is_told_unless_that_is_said_to_be_meant() {
+    assert_eq!(told(&two_tpdos("period_ms = 100", "timeout_ms = 500", "")), [""; 0]);
+    assert_eq!(told(&two_tpdos("period_ms = 100", "timeout_ms = 0", "")), [""; 0]);
+    assert_eq!(
+        told(&two_tpdos("period_ms = 100", "", "")),
+        [
+            "own.toml:8:7: warning: TPDO 2 is not supervised: when it no longer comes, its last values stay good\n  hint: give it `period_ms` or `timeout_ms`; `timeout_ms = 0` says that it is meant so"
+        ]
+    );
+    let unwatched = "[error_control]\nkind = 'none'";
+    let never = "nobody would notice that the device is gone";
+    let told = told(&two_tpdos("period_ms = 100", "timeout_ms = 0", unwatched));
+    assert!(
+        matches!(told.as_slice(), [one] if one.contains("warning: TPDO 2") && one.contains(never)),
+        "{told:?}"
+    );
+    let config = CONFIG.replace("id = 2\n", "id = 2\nguard_time_ms = 0\npdo_timeout_ms = 0\n");
+    let warnings = load(&config).unwrap().warnings;
+    assert_eq!(warnings.len(), 1, "{warnings:?}");
+    assert!(warnings[0].message.contains(never) && warnings[0].line == 14, "{warnings:?}");
+}
+
+#[test]
+fn values_and_their_validity_are_paired_by_their_numbers() {
+    let tags = |first: u8| {
+        format!(
+            "[[tag]]\nname = 'level_{{}}'\narray = {{ first = 1, count = 3 }}\ntpdo = 1\nbit = 0\ntype = 'u8'\n\
+             [[tag]]\nname = 'ok_{{}}'\narray = {{ first = {first}, count = 3 }}\ntpdo = 2\nbit = 0\ntype = 'bool'\n\
+             [[derived]]\nname = 'highest'\nmaximum = 'level_*'\nwhere = 'ok_*'\n"
+        )
+    };
+    let told = |first| {
+        let source = two_tpdos("period_ms = 100", "period_ms = 100", "");
+        told(&SourceText::new("own.toml", source.text + &tags(first)))
+    };
+    assert_eq!(told(1), [""; 0]);
+    let wrong = told(2);
+    assert!(
+        matches!(wrong.as_slice(), [one] if one.ends_with(
+            "error: `level_1` has no tag in `where`: those there are numbered 2, 3, 4\n  hint: give both the same numbers, or list the tags one by one in the same order"
+        )),
+        "{wrong:#?}"
+    );
+}
+
+#[test]
+fn a_key_that_would_change_nothing_is_told() {
+    let config = CONFIG.replace("id = 2\n", "id = 2\ntag.alarm_on_unused_bad.deadband = 3\n");
+    let problems = load(&config).err().unwrap_or_default();
+    assert!(
+        matches!(problems.as_slice(), [one] if one.to_string() ==
+            "cangate.toml:13:5: error: `alarm_on_unused_bad` is a parameter, not a tag of the device\n  hint: set it under [node.NAME.parameters]"),
+        "{problems:?}"
+    );
+    let stride = "array = { first = 1, count = 4, bit_stride = 2 }";
+    for (from, entry) in
+        [("when = \"not wire_broken_{}\"", "input_ok"), ("when = \"wire_broken_{}\"", "wire_broken")]
+    {
+        let at = example().find(from).unwrap();
+        let (before, after) = example().split_at(at);
+        let array = before.rfind("array = { first = 1, count = 4 }").unwrap();
+        let text = format!(
+            "{}{}{after}",
+            &before[..array],
+            before[array..].replacen("array = { first = 1, count = 4 }", stride, 1)
+        );
+        let told = told(&SourceText::new("t4.toml", text));
+        assert!(
+            matches!(told.as_slice(), [one] if one.ends_with("error: `bit_stride` means nothing here\n  hint: it is for tags of a TPDO; leave it out")),
+            "{entry}: {told:#?}"
+        );
     }
 }

@@ -9,7 +9,7 @@ use super::super::file::AlarmSection;
 use super::super::table::{AlarmCondition, AlarmDef, AlarmOwner, BuiltIn};
 use super::super::{At, SourceText};
 use super::derived::condition;
-use super::items::{Element, elements};
+use super::items::{Element, elements, refuse_stride};
 use super::order::causes_first;
 use super::problems::{Problems, is_snake_case, matched};
 use super::tags::Context;
@@ -220,6 +220,7 @@ fn from_mapping(
     let mut names: BTreeMap<String, usize> = BTreeMap::new();
     for section in &context.file.alarm {
         check_bit(problems, context, section, &mut bits);
+        refuse_stride(problems, context.source, section.array.as_ref());
         for element in elements(problems, context.source, &section.name, section.array.as_ref()) {
             let name = element.fill(&section.name.value);
             check_name(problems, context, section, &name, known, &mut names);

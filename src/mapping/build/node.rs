@@ -18,14 +18,44 @@ const LONGEST_PERIOD: u64 = 3_600_000;
 
 /// The settings of a node.
 pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> NodeSettings {
+    let error_control = error_control(problems, context);
+    let pdos = context.tpdos.iter().map(|tpdo| {
+        let pdo = pdo(problems, context, id, tpdo.key, tpdo.section);
+        if pdo.timeout.is_none() {
+            warn_of_silence(problems, context, tpdo, error_control == ErrorControl::None);
+        }
+        pdo
+    });
     NodeSettings {
         id,
-        error_control: error_control(problems, context),
+        pdos: pdos.collect(),
+        error_control,
         start: start(problems, context),
         sdo: None,
         boot: BootSettings::default(),
-        pdos: context.tpdos.iter().map(|tpdo| pdo(problems, context, id, tpdo.key, tpdo.section)).collect(),
         never_seen_after: NEVER_SEEN_AFTER,
+    }
+}
+
+/// A TPDO without a timeout: its values stay good for ever, so that has to be meant. Where nothing else watches the node it
+/// cannot be.
+fn warn_of_silence(problems: &mut Problems, context: &Context<'_>, tpdo: &Tpdo<'_>, unwatched: bool) {
+    let off = either(context, context.entry.pdo_timeout_ms.as_ref(), tpdo.section.timeout_ms.as_ref());
+    let (source, span) = off.map_or((context.source, &tpdo.key.span), |(source, at)| (source, &at.span));
+    if unwatched {
+        let message = format!(
+            "TPDO {} is not supervised and the node neither guarded nor sends heartbeats: nobody would notice that the \
+             device is gone",
+            tpdo.key.value
+        );
+        problems.warning(source, span, message, "give the TPDO a time-out, or the node an error control");
+    } else if off.is_none() {
+        let message = format!(
+            "TPDO {} is not supervised: when it no longer comes, its last values stay good",
+            tpdo.key.value
+        );
+        let hint = "give it `period_ms` or `timeout_ms`; `timeout_ms = 0` says that it is meant so";
+        problems.warning(source, span, message, hint);
     }
 }
 

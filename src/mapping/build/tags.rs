@@ -377,8 +377,13 @@ fn check_overrides(problems: &mut Problems, context: &Context<'_>) {
         .map(|item| (item.name.as_str(), matches!(item.entry, Entry::Parameter(_))))
         .collect();
     for pattern in context.entry.tag.keys() {
-        if !names.keys().any(|name| matched(&pattern.value, name).is_some()) {
+        let mut found = names.iter().filter(|(name, _)| matched(&pattern.value, name).is_some()).peekable();
+        if found.peek().is_none() {
             problems.unknown(context.config, &pattern.span, "tag", &pattern.value, names.keys().copied());
+        } else if found.all(|(_, parameter)| *parameter) {
+            let message = format!("`{}` is a parameter, not a tag of the device", pattern.value);
+            let hint = "set it under [node.NAME.parameters]";
+            problems.error(context.config, &pattern.span, message, hint);
         }
     }
     let parameters = names.iter().filter(|(_, parameter)| **parameter).map(|(name, _)| *name);
