@@ -56,7 +56,7 @@
 //! |---|---|
 //! | a device | one file in `mappings/`; no Rust, but for the line in `mapping/shipped.rs` that builds it in |
 //! | a data type or scaling rule | `mapping/codec.rs`, `mapping/build/fields.rs` |
-//! | a derived tag | `mapping/table.rs` ([`mapping::Derived`]), `mapping/file.rs`, `mapping/build/derived.rs`, `gateway/derived.rs` |
+//! | a derived tag | `mapping/table.rs` ([`mapping::Derived`]), `mapping/file.rs`, `mapping/build/derived.rs`, `gateway/derived.rs`, `modbus/source.rs` |
 //! | an alarm that needs the gateway's own eyes | [`mapping::BuiltIn`], `mapping/builtin.rs`, `gateway/conditions.rs` |
 //! | a northbound | a new room; one field in `config`; one spawn in `supervisor` |
 
