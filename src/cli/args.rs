@@ -164,6 +164,9 @@ pub struct SimArguments {
 pub enum SimDevice {
     /// MOTORTECH DetCon detonation controller.
     Detcon,
+    /// Danfoss DST P92C pressure transmitter.
+    #[value(name = "dst-p92c")]
+    DstP92c,
 }
 
 /// `cangate replay`

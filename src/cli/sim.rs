@@ -110,6 +110,7 @@ fn names(kind: Kind) -> String {
 pub(super) fn command(arguments: &SimArguments) -> Exit {
     let kind = match arguments.device {
         SimDevice::Detcon => Kind::Detcon,
+        SimDevice::DstP92c => Kind::DstP92c,
     };
     let Some(node) = NodeId::new(arguments.node) else { return Exit::Usage };
     let options = SimOptions {

@@ -2,6 +2,7 @@
 
 use super::detcon::{self, DetconSettings, SimulatedDetcon};
 use super::device::{Device, DevicePlan};
+use super::dst_p92c::{self, DstSettings, SimulatedDst};
 use super::order;
 use super::scenario::Shipped;
 use super::slave;
@@ -12,6 +13,8 @@ use crate::time::Now;
 pub enum Kind {
     /// MOTORTECH DetCon detonation controller.
     Detcon,
+    /// Danfoss DST P92C pressure transmitter.
+    DstP92c,
 }
 
 /// What a device of each kind is like: the `[device]` table of its scenario.
@@ -19,17 +22,20 @@ pub enum Kind {
 pub enum Settings {
     /// Of a DetCon.
     Detcon(DetconSettings),
+    /// Of a DST P92C.
+    DstP92c(Box<DstSettings>),
 }
 
 impl Kind {
     /// All kinds.
-    pub const ALL: [Self; 1] = [Self::Detcon];
+    pub const ALL: [Self; 2] = [Self::Detcon, Self::DstP92c];
 
     /// The word on the command line.
     #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
             Self::Detcon => "detcon",
+            Self::DstP92c => "dst-p92c",
         }
     }
 
@@ -38,6 +44,7 @@ impl Kind {
     pub const fn shipped(self) -> &'static [Shipped] {
         match self {
             Self::Detcon => &detcon::SCENARIOS,
+            Self::DstP92c => &dst_p92c::SCENARIOS,
         }
     }
 
@@ -46,6 +53,7 @@ impl Kind {
     pub fn help(self) -> String {
         let own = match self {
             Self::Detcon => detcon::control::HELP,
+            Self::DstP92c => dst_p92c::action::HELP,
         };
         [own, slave::HELP, order::HELP].join("\n")
     }
@@ -54,6 +62,7 @@ impl Kind {
     pub(super) fn undo(self, words: &[&str]) -> Option<String> {
         match self {
             Self::Detcon => detcon::control::undo(words),
+            Self::DstP92c => dst_p92c::action::undo(words),
         }
     }
 }
@@ -64,6 +73,7 @@ impl Settings {
     pub const fn kind(&self) -> Kind {
         match self {
             Self::Detcon(_) => Kind::Detcon,
+            Self::DstP92c(_) => Kind::DstP92c,
         }
     }
 
@@ -71,6 +81,7 @@ impl Settings {
     pub(super) fn check(&self, words: &[&str]) -> Result<(), String> {
         match self {
             Self::Detcon(settings) => detcon::control::check(settings, words).map(drop),
+            Self::DstP92c(_) => dst_p92c::action::parse(words).map(drop),
         }
     }
 }
@@ -81,6 +92,7 @@ impl DevicePlan {
     pub fn power_on(&self, now: Now) -> Box<dyn Device> {
         match &self.scenario.settings {
             Settings::Detcon(settings) => Box::new(SimulatedDetcon::power_on(self, settings, now)),
+            Settings::DstP92c(settings) => Box::new(SimulatedDst::power_on(self, settings, now)),
         }
     }
 }

@@ -4,21 +4,25 @@
 //! of everything in this crate that lives in time. Not here: anything that the gateway knows of a device; the two sides
 //! meet on the bus only, and share nothing but frames, identifiers and the words of NMT.
 //!
-//! - [`kind`]: the list of devices; each has a folder: [`detcon`].
+//! - [`kind`]: the list of devices; each has a folder: [`detcon`], [`dst_p92c`].
 //! - [`device`]: what a device is to whoever puts it on a bus.
-//! - [`slave`]: what every slave does.
-//! - [`order`]: what can be ordered of one. [`scenario`]: orders at given times; `scenario_file` reads them.
-//! - [`random`]: noise.
+//! - [`slave`]: what every slave does; [`sdo_server`], [`lss_slave`] and [`emcy`] what some do.
+//! - [`order`]: what can be ordered of one; [`scenario`]: orders at given times, which `scenario_file` reads.
+//! - [`random`]: where noise comes from.
 //! - [`task`] \[IO\]: puts devices on a bus.
 
 pub mod detcon;
 pub mod device;
+pub mod dst_p92c;
+pub mod emcy;
 pub mod error;
 pub mod kind;
+pub mod lss_slave;
 pub mod order;
 pub mod random;
 pub mod scenario;
 mod scenario_file;
+pub mod sdo_server;
 pub mod slave;
 pub mod task;
 

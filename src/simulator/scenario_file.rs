@@ -9,6 +9,7 @@ use serde::{Deserialize, Deserializer};
 use toml::Spanned;
 
 use super::detcon;
+use super::dst_p92c;
 use super::error::{Problem, SimulatorError};
 use super::kind::{Kind, Settings};
 use super::scenario::{Event, Scenario};
@@ -84,6 +85,7 @@ impl Scenario {
         let reader = Reader { file, text, problems: Vec::new() };
         match kind {
             Kind::Detcon => reader.read::<detcon::DeviceTable>(),
+            Kind::DstP92c => reader.read::<dst_p92c::DeviceTable>(),
         }
     }
 }

@@ -142,28 +142,30 @@ reserved bits on|off          reserved bits are set";
 /// The order in a line, if a device that is like this takes it: what would do nothing is refused with the reason.
 pub fn check(settings: &DetconSettings, words: &[&str]) -> Result<Control, String> {
     let control = parse(words)?;
-    match control {
-        Control::Knock(channel, _) | Control::SensorBad(channel, _) if channel.get() > settings.cylinders => {
-            let cylinders = settings.cylinders;
-            Err(format!(
-                "the engine has {cylinders} cylinders; give a channel up to that, or set `cylinders` in a scenario"
-            ))
-        }
-        Control::Trip(pulse) if pulse < INHIBIT_TIME => {
-            let shortest = INHIBIT_TIME.as_millis();
-            Err(format!(
-                "a trip pulse of {} ms can begin and end between two TPDO3; give at least {shortest}",
-                pulse.as_millis()
-            ))
-        }
-        control => Ok(control),
+    if let Control::Knock(channel, _) | Control::SensorBad(channel, _) = control
+        && channel.get() > settings.cylinders
+    {
+        let cylinders = settings.cylinders;
+        return Err(format!(
+            "the engine has {cylinders} cylinders; give a channel up to that, or set `cylinders` in a scenario"
+        ));
     }
+    if let Control::Trip(pulse) = control
+        && pulse < INHIBIT_TIME
+    {
+        let (pulse, shortest) = (pulse.as_millis(), INHIBIT_TIME.as_millis());
+        return Err(format!(
+            "a trip pulse of {pulse} ms can begin and end between two TPDO3; give at least {shortest}"
+        ));
+    }
+    Ok(control)
 }
 
 /// The order that ends another; `None` where it does not last.
+#[must_use]
 pub fn undo(words: &[&str]) -> Option<String> {
     match words {
-        ["trip", ..] | ["clear", ..] => None,
+        ["trip" | "clear", ..] => None,
         ["sensor", channel, "bad"] => Some(format!("sensor {channel} good")),
         ["set", name, _] => Some(format!("clear {name}")),
         others => switched_off(others),
