@@ -12,6 +12,8 @@
 //! - [`settings`]: what a network and its nodes are to do.
 //! - [`object`]: objects of an object dictionary, and their values as text.
 //! - [`sdo`]: reads and writes them; [`lss`]: gives devices node ids and bit rates.
+//! - [`census`], [`probe`]: who is on a bus, by listening and by asking; for tools.
+//! - [`well_known`]: names and types of the objects that CiA 301 defines.
 //! - [`event`]: what a network tells.
 //! - [`boot`]: what is done with a node before it is started.
 //! - `guarding`, `heartbeat`, `start`, `pdo`, `duplicate`: one machine each, for one node.
@@ -19,6 +21,7 @@
 //! - `network`: all nodes of a bus; dispatches frames.
 
 pub mod boot;
+pub mod census;
 pub mod cob_id;
 mod duplicate;
 pub mod event;
@@ -31,10 +34,12 @@ mod node;
 pub mod object;
 mod outputs;
 mod pdo;
+pub mod probe;
 mod reception;
 pub mod sdo;
 pub mod settings;
 mod start;
+pub mod well_known;
 
 pub use cob_id::NodeId;
 pub use event::{ForeignEvent, NetworkOutput, NodeEvent};

@@ -13,6 +13,7 @@
 //! - [`expression`]: conditions on tags; [`expression_parser`] reads them.
 //! - [`objection`]: why a value should not be used as it stands.
 //! - [`codec`]: raw bits to values, values to registers.
+//! - [`fingerprint`]: which mapping fits a node that was only overheard.
 //! - [`diagnostic`]: messages about files. [`reader`]: strict TOML; [`At`]: a value and its place; [`suggest`]: "did you mean".
 
 mod at;
@@ -25,6 +26,7 @@ pub mod expression;
 pub mod expression_parser;
 pub mod file;
 pub mod file_values;
+pub mod fingerprint;
 pub mod installation;
 pub mod objection;
 pub mod reader;
