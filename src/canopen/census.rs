@@ -367,7 +367,11 @@ mod tests {
     fn tpdos_have_a_number_a_length_and_a_period() {
         let frames: Vec<(u64, &str)> = (0..5)
             .flat_map(|n| {
-                [(n * 500, "181#00FF80017FFE3340"), (n * 500 + 3, "481#0019FF800301"), (n * 500 + 5, "382#0000000000")]
+                [
+                    (n * 500, "181#00FF80017FFE3340"),
+                    (n * 500 + 3, "481#0019FF800301"),
+                    (n * 500 + 5, "382#0000000000"),
+                ]
             })
             .collect();
         let census = census(&frames);
@@ -400,7 +404,8 @@ mod tests {
 
     #[test]
     fn r_dst_074_emergencies_are_kept_by_code() {
-        let census = census(&[(0, "081#11F0210000000000"), (5, "081#11F0210000000000"), (9, "081#0000000000000000")]);
+        let census =
+            census(&[(0, "081#11F0210000000000"), (5, "081#11F0210000000000"), (9, "081#0000000000000000")]);
         assert_eq!(node(&census, 1).emergencies, BTreeMap::from([(0xF011, 2), (0, 1)]));
         assert_eq!(node(&census, 1).error_register, Some(0));
     }
@@ -428,7 +433,8 @@ mod tests {
 
     #[test]
     fn a_node_to_which_somebody_only_talks_was_not_heard() {
-        let census = census(&[(0, "601#4000100000000000"), (5, "702#R1"), (6, "203#00"), (7, "584#4300100094010200")]);
+        let census =
+            census(&[(0, "601#4000100000000000"), (5, "702#R1"), (6, "203#00"), (7, "584#4300100094010200")]);
         let heard: Vec<u8> =
             census.nodes.iter().filter(|(_, node)| node.is_heard()).map(|(id, _)| id.get()).collect();
         assert_eq!(heard, [4]);

@@ -15,7 +15,7 @@ fn run(mut probe: Probe, answers: &Answers) -> (Vec<(u64, String)>, Vec<ProbeOut
     let mut now = Instant::START;
     probe.handle_timeout(now);
     loop {
-        let mut arrived = Vec::new();
+        let mut arrived: Vec<CanFrame> = Vec::new();
         while let Some(output) = probe.poll_output() {
             match output {
                 ProbeOutput::Transmit(frame) => {
@@ -79,7 +79,14 @@ fn silent_nodes_get_one_sdo_request_and_one_guard_request_and_nothing_else() {
     let frames: Vec<&str> = frames.iter().map(|(_, frame)| frame.as_str()).collect();
     assert_eq!(
         frames,
-        ["601#4000100000000000", "602#4000100000000000", "603#4000100000000000", "701#R1", "702#R1", "703#R1"]
+        [
+            "601#4000100000000000",
+            "602#4000100000000000",
+            "603#4000100000000000",
+            "701#R1",
+            "702#R1",
+            "703#R1"
+        ]
     );
     assert_eq!(told, [ProbeOutput::Done { not_sent: 0, nobody_acknowledges: false }]);
 }

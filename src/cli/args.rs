@@ -8,6 +8,7 @@ use clap_complete::Shell;
 
 use super::health::Url;
 use super::schema::Schema;
+use super::tool_args::{InitArguments, NmtArguments, ScanArguments, SdoArguments};
 use crate::can::interface::Interface;
 use crate::config::DEFAULT_FILE;
 use crate::modbus::MapFormat;
@@ -55,6 +56,15 @@ pub enum Subcommand {
     Man(ManArguments),
     /// Ask the gateway on this host whether it is ready; exit code 1 when it is not. For containers and watchdogs.
     Health(HealthArguments),
+    /// Tell who is on a bus. Without --active NOTHING is sent, not one frame; where the controller can, not even
+    /// acknowledges.
+    Scan(ScanArguments),
+    /// Write a first configuration from what a scan finds.
+    Init(InitArguments),
+    /// Send an NMT command to a node, or to all.
+    Nmt(NmtArguments),
+    /// Read or write an object of a node.
+    Sdo(SdoArguments),
 }
 
 /// `cangate run`

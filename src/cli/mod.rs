@@ -1,7 +1,7 @@
 //! The command line: one file for each subcommand, thin. \[IO\]
 //!
-//! Exit codes: 0 ok, 1 a comparison found a difference or a gateway is not ready, 64 usage, 70 our bug, 74 a port or a
-//! file cannot be used at the start, 78 what a file says is wrong.
+//! Exit codes: 0 ok, 1 a comparison found a difference, a gateway is not ready or a device refused, 64 usage, 70 our
+//! bug, 74 a port, a bus or a file cannot be used at the start, 78 what a file says is wrong.
 
 mod args;
 pub mod check;
@@ -9,14 +9,21 @@ mod completions;
 mod demo;
 mod health;
 mod import;
+mod init;
 mod load;
 mod man;
 mod map;
+mod nmt;
 mod output;
 mod replay;
 mod run;
+mod scan;
+mod scan_report;
 pub mod schema;
+mod sdo;
+mod session;
 pub mod sim;
+mod tool_args;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::process::ExitCode;
@@ -35,6 +42,8 @@ pub enum Exit {
     Different,
     /// 1: the gateway that was asked is not ready.
     NotReady,
+    /// 1: the device that was asked refused, or did not answer.
+    Refused,
     /// 64: the command line is wrong.
     Usage,
     /// 70: a bug of ours.
@@ -51,7 +60,7 @@ impl Exit {
     pub fn code(self) -> u8 {
         match self {
             Self::Ok => 0,
-            Self::Different | Self::NotReady => 1,
+            Self::Different | Self::NotReady | Self::Refused => 1,
             Self::Usage => 64,
             Self::Bug => 70,
             Self::Io => 74,
@@ -92,6 +101,10 @@ fn dispatch(command: Subcommand) -> Exit {
         Subcommand::Completions(options) => completions::run(&options),
         Subcommand::Man(options) => man::run(&options),
         Subcommand::Health(options) => health::run(&options),
+        Subcommand::Scan(options) => scan::run(&options),
+        Subcommand::Init(options) => init::run(&options),
+        Subcommand::Nmt(options) => nmt::run(&options),
+        Subcommand::Sdo(options) => sdo::run(&options),
     }
 }
 
@@ -129,6 +142,14 @@ mod tests {
             &["completions", "bash"],
             &["man"],
             &["health", "http://127.0.0.1:8080/readyz"],
+            &["scan", "-i", "can0"],
+            &["scan", "-i", "can0", "--active", "--nodes", "1-10", "--format", "json"],
+            &["init", "-i", "can0", "-o", "new.toml", "--force"],
+            &["init", "--scan-file", "scan.json"],
+            &["nmt", "-i", "can0", "start", "1"],
+            &["nmt", "-i", "can0", "reset-node", "all", "--yes"],
+            &["sdo", "-i", "can0", "--node", "1", "read", "0x1000:0"],
+            &["sdo", "-i", "can0", "--node", "1", "write", "0x6124:1", "-1.5", "--type", "f32"],
         ] {
             let line = std::iter::once("cangate").chain(words.iter().copied());
             assert!(CommandLine::try_parse_from(line).is_ok(), "{words:?}");

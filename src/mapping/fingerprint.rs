@@ -126,7 +126,8 @@ type = "i32"
 "#;
 
     fn sighting(node: u8, tpdos: &[(u16, &[u8])]) -> Sighting {
-        let tpdos = tpdos.iter().map(|(id, lengths)| (CanId::Standard(*id), lengths.iter().copied().collect()));
+        let tpdos =
+            tpdos.iter().map(|(id, lengths)| (CanId::Standard(*id), lengths.iter().copied().collect()));
         Sighting { node: NodeId::new(node).unwrap(), tpdos: tpdos.collect(), heartbeat: None, name: None }
     }
 
