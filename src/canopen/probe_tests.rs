@@ -20,7 +20,9 @@ fn run(mut probe: Probe, answers: &Answers) -> (Vec<(u64, String)>, Vec<ProbeOut
             match output {
                 ProbeOutput::Transmit(frame) => {
                     frames.push((now.as_millis(), frame.to_string()));
-                    arrived.extend(answers.get(&frame.to_string()).map(|text| text.parse().unwrap()));
+                    arrived.extend(
+                        answers.get(&frame.to_string()).map(|text| text.parse::<CanFrame>().unwrap()),
+                    );
                 }
                 other => told.push(other),
             }

@@ -223,7 +223,7 @@ at_ms = 8
 do = ["clear trip", "clear all"]
 "#;
     let scenario = parse("all.toml", text).unwrap();
-    let Settings::Detcon(settings) = &scenario.settings;
+    let Settings::Detcon(settings) = &scenario.settings else { panic!("{:?}", scenario.settings) };
     assert_eq!(settings.cylinders, 12);
     assert_eq!(settings.initialisation, Duration::from_millis(200));
     assert!(!settings.event_restarts_period && settings.format.big_endian_sensor_fields);
