@@ -52,4 +52,5 @@ mod mqtt_publisher;
 mod properties;
 mod requirements;
 mod support;
+mod transmitter;
 mod web_server;

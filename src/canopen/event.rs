@@ -123,6 +123,13 @@ pub enum NodeEvent {
     },
     /// What its boot found, did, or failed at.
     Boot(BootEvent),
+    /// An object that is polled was read.
+    Polled {
+        /// Which, by its place in [`NodeSettings::polls`](super::NodeSettings::polls).
+        poll: usize,
+        /// Its bytes, little-endian, or why it could not be read.
+        result: Result<Vec<u8>, SdoError>,
+    },
     /// A transfer that was asked for is over: the bytes that were read (none after a write), or why it failed.
     Sdo {
         /// As it was asked for.

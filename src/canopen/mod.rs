@@ -16,6 +16,7 @@
 //! - [`well_known`]: names and types of the objects that CiA 301 defines.
 //! - [`event`]: what a network tells.
 //! - [`boot`]: what is done with a node before it is started.
+//! - [`polls`]: objects that are read again and again.
 //! - `guarding`, `heartbeat`, `start`, `pdo`, `duplicate`: one machine each, for one node.
 //! - `node`: one node, made of those machines; `reception`: what its frames mean for it.
 //! - `network`: all nodes of a bus; dispatches frames.
@@ -34,6 +35,7 @@ mod node;
 pub mod object;
 mod outputs;
 mod pdo;
+pub mod polls;
 pub mod probe;
 mod reception;
 pub mod sdo;

@@ -11,6 +11,7 @@ use super::guarding::{Failure, Guarding};
 use super::heartbeat::Heartbeat;
 use super::outputs::Outputs;
 use super::pdo::Pdos;
+use super::polls::Polls;
 use super::sdo::{Refused, SdoClient, SdoOutput, SdoRequest, TransferId};
 use super::start::Start;
 use super::{ErrorControl, NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex, Role, cob_id};
@@ -29,6 +30,7 @@ pub(super) struct Node {
     pub(super) start: Option<Start>,
     pub(super) sdo: Option<SdoClient>,
     pub(super) boot: Boot,
+    pub(super) polls: Polls,
     /// TPDOs of which the node has told another identifier.
     moved: Vec<(PdoIndex, Option<CanId>)>,
     pub(super) pdos: Pdos,
@@ -134,6 +136,7 @@ impl Node {
             start: master.then(|| Start::new(settings.start, boot.is_done())),
             sdo,
             boot,
+            polls: Polls::new(settings.polls),
             moved: Vec::new(),
             duplicate: Duplicate::new(&settings.pdos),
             pdos: Pdos::new(settings.pdos),
@@ -273,6 +276,7 @@ impl Node {
             start.pause();
         }
         self.boot.pause();
+        self.polls.stop();
         if let Some(sdo) = &mut self.sdo {
             sdo.pause();
         }
@@ -329,6 +333,7 @@ impl Node {
         }
         self.boot.handle_timeout(now);
         self.transfer(now, outputs);
+        self.poll(now, outputs);
         while let Some(pdo) = self.pdos.next_late(now) {
             outputs.node(self.id, NodeEvent::PdoTimeout { pdo });
         }
@@ -367,6 +372,7 @@ impl Node {
             start,
             sdo,
             self.boot.poll_timeout(),
+            self.polls.poll_timeout(),
             self.pdos.poll_timeout(),
             self.duplicate.poll_timeout(),
             never_seen,
@@ -414,11 +420,28 @@ impl Node {
                 match output {
                     SdoOutput::Transmit(frame) => outputs.transmit(frame),
                     SdoOutput::Done(id, result) if Boot::is_mine(id) => self.boot.handle_sdo(now, id, result),
+                    SdoOutput::Done(id, result) if Polls::is_mine(id) => {
+                        if let Some(poll) = self.polls.handle_sdo(id) {
+                            outputs.node(self.id, NodeEvent::Polled { poll, result });
+                        }
+                    }
                     SdoOutput::Done(id, result) => outputs.node(self.id, NodeEvent::Sdo { id, result }),
                 }
             } else {
                 return;
             }
+        }
+    }
+
+    /// Reads the next object that is due. A stopped node answers no SDO (R-DST-071): that turn is left out.
+    fn poll(&mut self, now: Instant, outputs: &mut Outputs) {
+        let Some((id, request)) = self.polls.handle_timeout(now) else { return };
+        let taken = self.state != Some(NmtState::Stopped)
+            && self.sdo.as_mut().is_some_and(|sdo| sdo.request(now, id, request).is_ok());
+        if taken {
+            self.transfer(now, outputs);
+        } else {
+            self.polls.handle_sdo(id);
         }
     }
 
@@ -447,6 +470,9 @@ impl Node {
                 }
                 let done = matches!(event, BootEvent::Done { .. });
                 outputs.node(self.id, NodeEvent::Boot(event));
+                if done {
+                    self.polls.begin(now);
+                }
                 if let Some(start) = self.start.as_mut().filter(|_| done) {
                     start.handle_boot_done(now, self.state == Some(NmtState::Operational));
                 }
@@ -474,6 +500,7 @@ impl Node {
     pub(super) fn lost(&mut self, stuck_toggle: bool, outputs: &mut Outputs) {
         self.supervised = false;
         outputs.node(self.id, NodeEvent::Lost { stuck_toggle });
+        self.polls.stop();
         self.pdos.stop();
         if let Some(start) = &mut self.start {
             start.cancel();

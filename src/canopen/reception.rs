@@ -77,6 +77,7 @@ impl Node {
         }
         if !self.boot.is_empty() {
             self.boot.handle_boot_up(now);
+            self.polls.stop();
             if let Some(start) = &mut self.start {
                 start.handle_boot_begun();
             }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use super::NodeId;
 use super::boot::BootSettings;
+use super::polls::Poll;
 use super::sdo::SdoSettings;
 use crate::can::CanId;
 
@@ -42,6 +43,8 @@ pub struct NodeSettings {
     pub sdo: Option<SdoSettings>,
     /// What is done before it is started; nothing without SDO or in the passive role.
     pub boot: BootSettings,
+    /// Objects that are read again and again once it is booted; none without SDO.
+    pub polls: Vec<Poll>,
     /// The TPDOs that it sends, in the order of the mapping; [`PdoIndex`] counts in it.
     pub pdos: Vec<PdoSettings>,
     /// How long after the start of the gateway a node that showed no frame at all is reported (R-DET-001).

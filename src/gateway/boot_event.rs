@@ -2,8 +2,10 @@
 
 use super::Gateway;
 use super::node::BootTrouble;
-use crate::canopen::boot::{BootEvent, BootFailure, MappedPdo};
-use crate::process_image::NodeIndex;
+use super::tags::CarrierIndex;
+use crate::canopen::boot::{BootEvent, BootFailure, BootStep, MappedPdo};
+use crate::canopen::sdo::SdoError;
+use crate::process_image::{NodeIndex, Quality, Reason};
 use crate::time::Now;
 
 impl Gateway {
@@ -17,9 +19,8 @@ impl Gateway {
             }),
             BootEvent::Deviation { pdo } => {
                 let number = self.pdo_number(at.1, *pdo);
-                self.tell(at, "pdo_mapping_differs", |event| {
-                    event.text =
-                        format!("TPDO{number} is mapped otherwise in the device than in its mapping file");
+                self.tell(at, "pdo_differs", |event| {
+                    event.text = format!("TPDO{number} is otherwise in the device than in its mapping file");
                 });
             }
             BootEvent::Mapped(mapped) => self.mapped(at, mapped),
@@ -36,13 +37,59 @@ impl Gateway {
         }
     }
 
+    /// A TPDO that the device maps otherwise than the mapping file carries nobody knows what: its tags are withheld.
     fn mapped(&mut self, at: (Now, NodeIndex), mapped: &MappedPdo) {
+        let (now, index) = at;
+        let wanted = self.table.nodes.get(index.0).and_then(|def| {
+            def.canopen.boot.steps.iter().find_map(|step| match step {
+                BootStep::Pdo(setup) if setup.pdo == mapped.pdo => Some(&setup.maps),
+                BootStep::Pdo(_)
+                | BootStep::Identity { .. }
+                | BootStep::Read { .. }
+                | BootStep::Write { .. }
+                | BootStep::Save => None,
+            })
+        });
+        let differs = wanted.is_some_and(|wanted| *wanted != mapped.maps);
+        let watch = self.nodes.get_mut(index.0).and_then(|node| node.watches.get_mut(mapped.pdo.0));
+        if let Some(watch) = watch {
+            watch.differs = differs;
+        }
+        if differs {
+            self.degrade(now, index, Some(mapped.pdo), Quality::Bad(Reason::MappingDiffers));
+            let number = self.pdo_number(index, mapped.pdo);
+            let maps = mapped.maps.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+            self.tell(at, "pdo_mapping_differs", |event| {
+                event.text = format!("the device maps TPDO{number} as: {maps}; its values are withheld");
+            });
+        }
         if mapped.cob_id.is_none() {
             let number = self.pdo_number(at.1, mapped.pdo);
             self.tell(at, "pdo_switched_off", |event| {
                 event.text = format!("TPDO{number} is switched off in the device (bit 31 of its COB-ID)");
             });
         }
+    }
+
+    /// An object that is polled was read, or could not be.
+    pub(super) fn polled(&mut self, at: (Now, NodeIndex), poll: usize, result: &Result<Vec<u8>, SdoError>) {
+        let (now, index) = at;
+        let (Some(def), Some(node)) = (self.table.nodes.get(index.0), self.nodes.get(index.0)) else {
+            return;
+        };
+        let carrier = CarrierIndex(def.canopen.pdos.len() + poll);
+        match result {
+            Ok(data) => {
+                let quality = node.quality_of_new_data(false);
+                self.tags.apply(&self.table, now, (index, carrier), data, quality);
+            }
+            Err(_) => {
+                self.count(index, |counters| &mut counters.sdo_errors);
+                let quality = Quality::Bad(Reason::ReadFailed);
+                self.tags.degrade(&self.table, now, index, Some(carrier), quality);
+            }
+        }
+        self.dirty_nodes.mark(index.0);
     }
 
     fn boot_failed(&mut self, at: (Now, NodeIndex), failure: &BootFailure) {

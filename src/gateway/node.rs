@@ -54,6 +54,8 @@ pub(super) struct PdoWatch {
     pub(super) fresh_until: Option<Instant>,
     /// Its alarm is not raised before: when it did not come, the cause could still have been another.
     pub(super) held_until: Option<Instant>,
+    /// The device maps it otherwise than the mapping file: what it carries is not known.
+    pub(super) differs: bool,
     /// Set reserved bits of the last frame.
     pub(super) reserved: u64,
     /// That it is too long has been told.

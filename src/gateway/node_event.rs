@@ -18,6 +18,7 @@ impl Gateway {
         let at = (now, index);
         match *event {
             NodeEvent::Boot(ref told) => self.boot_event(at, told),
+            NodeEvent::Polled { poll, ref result } => self.polled(at, poll, result),
             // Nobody asks for transfers but the boot, which keeps its results to itself.
             NodeEvent::Sdo { .. } => {}
             NodeEvent::FrameSeen => return self.frame_seen(at),
@@ -113,6 +114,9 @@ impl Gateway {
         else {
             return;
         };
+        if watch.differs {
+            return;
+        }
         status.last_received = Some(now.instant);
         status.received = status.received.saturating_add(1);
         let was_stale = std::mem::take(&mut status.stale);
@@ -383,7 +387,7 @@ impl Gateway {
         }
     }
 
-    fn count(&mut self, index: NodeIndex, counter: impl FnOnce(&mut NodeCounters) -> &mut u64) {
+    pub(super) fn count(&mut self, index: NodeIndex, counter: impl FnOnce(&mut NodeCounters) -> &mut u64) {
         if let Some(node) = self.nodes.get_mut(index.0) {
             let counter = counter(&mut node.status.counters);
             *counter = counter.saturating_add(1);

@@ -31,7 +31,7 @@ struct Layout {
     dependents: Vec<Vec<TagIndex>>,
 }
 
-/// Which carrier of a node: its TPDOs, by their places in its settings.
+/// Which carrier of a node: its TPDOs, by their places in its settings; then the objects that are polled, by theirs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct CarrierIndex(pub(super) usize);
 
@@ -263,18 +263,24 @@ impl Layout {
 impl NodeLayout {
     fn new(table: &TagTable, node: &NodeDef, dependents: &[Vec<TagIndex>]) -> Self {
         let mut carriers = Vec::new();
-        carriers.resize_with(node.canopen.pdos.len(), CarrierLayout::default);
+        let pdos = node.canopen.pdos.len();
+        carriers.resize_with(pdos + node.canopen.polls.len(), CarrierLayout::default);
         let mut derived = Vec::new();
         for tag in node.tags.clone().map(TagIndex) {
-            match table.tag(tag).map(|tag| &tag.source) {
-                Some(Source::Pdo { pdo, field, scale }) => {
-                    let scale = (*scale != Scale::IDENTITY).then_some(*scale);
-                    if let Some(carrier) = carriers.get_mut(*pdo) {
-                        carrier.placed.push(Placed { tag, field: *field, scale });
-                    }
+            let placed = match table.tag(tag).map(|tag| &tag.source) {
+                Some(Source::Pdo { pdo, field, scale }) => Some((*pdo, field, scale)),
+                Some(Source::Polled { poll, field, scale }) => Some((pdos + poll, field, scale)),
+                Some(Source::Derived(_)) => {
+                    derived.push(tag);
+                    None
                 }
-                Some(Source::Derived(_)) => derived.push(tag),
-                None => {}
+                None => None,
+            };
+            if let Some((carrier, field, scale)) = placed {
+                let scale = (*scale != Scale::IDENTITY).then_some(*scale);
+                if let Some(carrier) = carriers.get_mut(carrier) {
+                    carrier.placed.push(Placed { tag, field: *field, scale });
+                }
             }
         }
         for carrier in &mut carriers {
@@ -410,7 +416,7 @@ fn same(left: &Sample, right: &Sample) -> bool {
 /// A sample of the right kind in which nothing was received.
 fn never_received(source: &Source) -> Sample {
     let (raw, scale) = match source {
-        Source::Pdo { field, scale, .. } => {
+        Source::Pdo { field, scale, .. } | Source::Polled { field, scale, .. } => {
             let raw = match field.kind {
                 FieldKind::Bool => Value::Bool(false),
                 FieldKind::Unsigned => Value::Unsigned(0),

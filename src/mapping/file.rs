@@ -20,6 +20,8 @@ pub struct MappingFile {
     pub format: At<u64>,
     /// What device it is.
     pub device: DeviceSection,
+    /// What it says of itself; a node that says otherwise is not started.
+    pub identity: Option<IdentitySection>,
     /// How its life is watched.
     #[serde(default)]
     pub error_control: ErrorControlSection,
@@ -32,6 +34,9 @@ pub struct MappingFile {
     /// The TPDOs that it sends, by their number: `[tpdo.1]`.
     #[serde(default)]
     pub tpdo: BTreeMap<At<String>, TpdoSection>,
+    /// Objects that are written before it is started, where it has them otherwise.
+    #[serde(default)]
+    pub setup: Vec<SetupSection>,
     /// Constants that an installation can set for each node.
     #[serde(default)]
     pub parameter: Vec<ParameterSection>,
@@ -63,6 +68,10 @@ pub struct DeviceSection {
     /// The document that the mapping was made from.
     #[serde(default)]
     pub source: String,
+    /// Memory of `cangate import`: addresses below are not given to new objects, whoever had them.
+    pub registers_used: Option<u64>,
+    /// The same for the addresses of bits.
+    pub bits_used: Option<u64>,
 }
 
 /// `[error_control]`.
@@ -88,6 +97,8 @@ pub struct ErrorControlSection {
     pub rtr_dlc: Option<At<u64>>,
     /// Pause between an NMT command and the next guard request, 0..=10000. Default: 20.
     pub settle_ms: Option<At<u64>>,
+    /// Heartbeat that the node is to send (0x1017), 10..=65535; written where it differs. Absent: as the node has it.
+    pub heartbeat_ms: Option<At<u64>>,
     /// A heartbeat node is lost after this long without a sign of life, 10..=65535. Default: 1500.
     pub heartbeat_timeout_ms: Option<At<u64>>,
 }
@@ -129,13 +140,28 @@ pub struct PublishSection {
 pub struct TpdoSection {
     /// Its identifier: `"$NODEID+0x180"`, or a number; one above 0x7FF is a 29-bit identifier.
     pub cob_id: At<CobId>,
-    /// Bytes that it has, 1..=8; a shorter frame is discarded.
-    pub length: At<u64>,
+    /// Bytes that it has, 1..=8; a shorter frame is discarded. Follows from `maps` where that is given.
+    pub length: Option<At<u64>>,
+    /// What it carries, in order, each `"0xINDEX:SUB/BITS"`, for example `"0x6130:1/32"`.
+    #[serde(default)]
+    pub maps: Vec<At<String>>,
+    /// What is done where the node has another mapping. Default: write; without `maps` nothing is read or written.
+    #[serde(default)]
+    pub mapping: MappingWord,
+    /// Transmission type, 0..=255, written where it differs. Absent: as the node has it.
+    pub transmission_type: Option<At<u64>>,
+    /// Event timer, 0..=65535, written where it differs. Absent: as the node has it.
+    pub event_timer_ms: Option<At<u64>>,
+    /// Inhibit time in microseconds, 0..=6553500 in steps of 100, written where it differs. Absent: as the node has it.
+    pub inhibit_time_us: Option<At<u64>>,
+    /// Mark the PDO as not valid while its mapping is changed. Default: false.
+    #[serde(default)]
+    pub set_pdo_invalid: bool,
     /// Time between two frames when nothing happens, 1..=3600000.
     pub period_ms: Option<At<u64>>,
     /// Shortest time between two frames that the device is known to keep, 1..=3600000; a much faster rate is suspicious.
     pub shortest_period_ms: Option<At<u64>>,
-    /// Stale after this long, 10..=3600000; 0 = not supervised. Default: three periods.
+    /// Stale after this long, 10..=3600000; 0 = not supervised. Default: three periods, or three times the event timer.
     pub timeout_ms: Option<At<u64>>,
     /// Discard a frame that is too long instead of using its first bytes. Default: false.
     #[serde(default)]
@@ -143,6 +169,59 @@ pub struct TpdoSection {
     /// Bits that the maker calls reserved, each as `[first bit, how many]`; a set one is counted.
     #[serde(default)]
     pub reserved_bits: Vec<At<[u64; 2]>>,
+}
+
+/// `[identity]`: each key that is given must be what the node says.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct IdentitySection {
+    /// Device type, 0x1000.
+    pub device_type: Option<At<u64>>,
+    /// Vendor, 0x1018:1.
+    pub vendor_id: Option<At<u64>>,
+    /// Product code, 0x1018:2.
+    pub product_code: Option<At<u64>>,
+    /// Revision, 0x1018:3.
+    pub revision_number: Option<At<u64>>,
+}
+
+/// What is done where a node has another PDO mapping than the file.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum MappingWord {
+    /// It is changed in the node.
+    #[default]
+    Write,
+    /// It is told, and its values are withheld.
+    Verify,
+    /// Nothing is read or written: the file is believed.
+    Fixed,
+}
+
+/// `[[setup]]`: an object that is to have a value.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct SetupSection {
+    /// Which, `"0xINDEX:SUB"`.
+    pub object: At<String>,
+    /// `u8`..`u64`, `i8`..`i64`, `f32` or `f64`.
+    #[serde(rename = "type")]
+    pub kind: At<String>,
+    /// Its value.
+    pub value: At<SetupValue>,
+    /// A node that refuses it is started all the same. Default: false.
+    #[serde(default)]
+    pub optional: bool,
+}
+
+/// A number of either kind.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(untagged)]
+pub enum SetupValue {
+    /// A whole number.
+    Whole(i64),
+    /// Any other.
+    Real(f64),
 }
 
 /// `[[parameter]]`.
@@ -245,10 +324,14 @@ pub struct SharedKeys<'a> {
 tag_entry! {
     /// `[[tag]]`.
     pub struct TagSection {
-        /// Number of the TPDO that carries it.
-        pub tpdo: At<u64>,
+        /// Number of the TPDO that carries it, with `bit`; or `object` instead of both.
+        pub tpdo: Option<At<u64>>,
         /// Place of its lowest bit: byte b bit i = 8 b + i.
-        pub bit: At<u64>,
+        pub bit: Option<At<u64>>,
+        /// The object that it is, `"0xINDEX:SUB"`: taken from the TPDO that maps it, else read every `poll_ms`.
+        pub object: Option<At<String>>,
+        /// How often an object that no TPDO maps is read by SDO, 100..=86400000.
+        pub poll_ms: Option<At<u64>>,
         /// `bool`, `u1`..`u64`, `i2`..`i64`, `f32` or `f64`.
         #[serde(rename = "type")]
         #[schemars(regex(pattern = r"^(bool|f32|f64|[ui]([1-9]|[1-5][0-9]|6[0-4]))$"))]

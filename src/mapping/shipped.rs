@@ -1,8 +1,10 @@
 //! The mappings that come with the program.
 
 /// Name and text of each, by name.
-pub const SHIPPED: &[(&str, &str)] =
-    &[("motortech-detcon", include_str!("../../mappings/motortech-detcon.toml"))];
+pub const SHIPPED: &[(&str, &str)] = &[
+    ("danfoss-dst-p92c", include_str!("../../mappings/danfoss-dst-p92c.toml")),
+    ("motortech-detcon", include_str!("../../mappings/motortech-detcon.toml")),
+];
 
 /// The text of a shipped mapping.
 #[must_use]

@@ -177,6 +177,15 @@ pub enum Source {
         /// From raw to engineering units.
         scale: Scale,
     },
+    /// An object of the node that is read again and again, because no TPDO carries it.
+    Polled {
+        /// Which, by its place in the polls of the node's settings.
+        poll: usize,
+        /// How its bytes are read.
+        field: Field,
+        /// From raw to engineering units.
+        scale: Scale,
+    },
     /// Computed from other tags of the node.
     Derived(Derived),
 }

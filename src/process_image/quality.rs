@@ -36,6 +36,10 @@ pub enum Reason {
     NoInput,
     /// The device sends NaN or infinity (R-DST-037).
     NotANumber,
+    /// The object could not be read from the device.
+    ReadFailed,
+    /// The device maps its PDO otherwise than the mapping file.
+    MappingDiffers,
 }
 
 impl Quality {
@@ -95,6 +99,8 @@ impl Reason {
             Self::DuplicateNode => "duplicate_node",
             Self::NoInput => "no_input",
             Self::NotANumber => "not_a_number",
+            Self::ReadFailed => "read_failed",
+            Self::MappingDiffers => "mapping_differs",
         }
     }
 }

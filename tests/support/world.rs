@@ -70,8 +70,13 @@ pub struct World {
 impl World {
     /// An empty bus for `count` devices, at 0 s. `seed` chooses the weather's luck.
     pub fn new(count: u8, seed: u64) -> Self {
+        Self::with(installation(count), seed)
+    }
+
+    /// The same for any installation.
+    pub fn with(table: Arc<TagTable>, seed: u64) -> Self {
         Self {
-            table: installation(count),
+            table,
             image: ProcessImage::default(),
             weather: Weather::default(),
             gateway: None,

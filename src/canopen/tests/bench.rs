@@ -124,6 +124,7 @@ pub(super) fn detcon(id: u8) -> NodeSettings {
         start: StartSettings::default(),
         sdo: None,
         boot: BootSettings::default(),
+        polls: Vec::new(),
         pdos: [(1, 8), (2, 8), (3, 8), (4, 6)].into_iter().map(pdo).collect(),
         never_seen_after: Duration::from_secs(10),
     }

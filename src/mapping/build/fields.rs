@@ -2,12 +2,12 @@
 
 use std::ops::Range;
 
-use super::super::SourceText;
 use super::super::file::TagSection;
 use super::super::installation::ByteOrderWord;
 use super::super::table::{Field, FieldKind};
+use super::super::{At, SourceText};
 use super::items::{Entry, Item};
-use super::node::Tpdo;
+use super::node::{self, Tpdo};
 use super::problems::Problems;
 use super::tags::{Context, Kind};
 
@@ -59,8 +59,12 @@ pub fn field(
     let stride = section.array.as_ref().and_then(|array| array.value.bit_stride.as_ref());
     let stride =
         stride.map_or(u64::from(width), |stride| problems.within(source, stride, "bit_stride", 1..=64));
-    let bit = section.bit.value.saturating_add(item.element.index.saturating_mul(stride));
-    let number = section.tpdo.value;
+    let Some((number, first)) = place(problems, context, item, section) else {
+        return (NO_TPDO, Field { bit: 0, width, kind, big_endian: false, invert: section.invert });
+    };
+    let bit = first.value.saturating_add(item.element.index.saturating_mul(stride));
+    let (number_span, bit_span) = (&number.span, &first.span);
+    let number = number.value;
     let pdo = context.tpdos.iter().position(|tpdo| tpdo.number == number);
     match pdo.and_then(|place| context.tpdos.get(place)).map(|tpdo| tpdo.section) {
         // A TPDO whose entry is wrong has been told already.
@@ -73,10 +77,10 @@ pub fn field(
             } else {
                 format!("declared are: {}", known.join(", "))
             };
-            problems.error(source, &section.tpdo.span, format!("there is no [tpdo.{number}]"), hint);
+            problems.error(source, number_span, format!("there is no [tpdo.{number}]"), hint);
         }
         Some(tpdo) => {
-            let bits = tpdo.length.value.min(8) * 8;
+            let bits = node::length(tpdo).unwrap_or(8).min(8) * 8;
             let last = bit.saturating_add(u64::from(width) - 1);
             if last >= bits {
                 let message = format!(
@@ -84,7 +88,7 @@ pub fn field(
                     item.name
                 );
                 let hint = "byte b bit i is bit 8 b + i; check `bit`, `type` and the `length` of the TPDO";
-                problems.error(source, &section.bit.span, message, hint);
+                problems.error(source, bit_span, message, hint);
             }
         }
     }
@@ -95,8 +99,63 @@ pub fn field(
         big_endian: section.byte_order == ByteOrderWord::Big,
         invert: section.invert,
     };
-    check_byte_order(problems, source, &section.bit.span, &item.name, field);
+    check_byte_order(problems, source, bit_span, &item.name, field);
     (pdo.unwrap_or(NO_TPDO), field)
+}
+
+/// Where a tag stands: as it is written, or where the TPDO that maps its object has it.
+fn place(
+    problems: &mut Problems,
+    context: &Context<'_>,
+    item: &Item<'_>,
+    section: &TagSection,
+) -> Option<(At<u64>, At<u64>)> {
+    let source = context.source;
+    match (&section.tpdo, &section.bit, &section.object) {
+        (Some(tpdo), Some(bit), None) => Some((tpdo.clone(), bit.clone())),
+        (None, None, Some(object)) => {
+            let id = node::object(problems, source, object)?;
+            let found =
+                context.tpdos.iter().find_map(|tpdo| Some((tpdo.number, node::bit_of(tpdo.section, id)?)));
+            if found.is_none() && section.poll_ms.is_none() {
+                let message = format!("no TPDO maps {id}, so `{}` would never have a value", item.name);
+                problems.error(
+                    source,
+                    &object.span,
+                    message,
+                    "add it to `maps` of a TPDO, or give it a `poll_ms`",
+                );
+            }
+            let at = |value| At { value, span: object.span.clone() };
+            found.map(|(number, bit)| (at(number), at(bit)))
+        }
+        _ => {
+            let message = format!("`{}` needs either `tpdo` and `bit`, or `object`", item.name);
+            problems.error(source, &item.span, message, "write where it stands, or which object it is");
+            None
+        }
+    }
+}
+
+/// The poll of a tag whose object no TPDO maps, by its place among the polls of the node.
+pub fn poll(context: &Context<'_>, item: &Item<'_>) -> Option<usize> {
+    let mut place = 0;
+    for other in &context.items.list {
+        let Entry::Tag(section) = other.entry else { continue };
+        if node::polled(context, section).is_some() {
+            if other.name == item.name {
+                return Some(place);
+            }
+            place += 1;
+        }
+    }
+    None
+}
+
+/// The field of a polled object: all of its bytes.
+pub fn whole(section: &TagSection) -> Option<Field> {
+    let (kind, width) = parse(&section.kind.value)?;
+    Some(Field { bit: 0, width, kind, big_endian: false, invert: section.invert })
 }
 
 /// Only whole bytes can be turned round.

@@ -2,7 +2,7 @@
 //!
 //! - this file: what an installation is, and the way through its buses and nodes.
 //! - `items`: the tags of a mapping, arrays unrolled. `tags`, `fields`, `derived`: what they become.
-//! - `node`: what the CANopen master needs to know.
+//! - `node`: what the CANopen master needs to know; `boot`: what it does before it starts the node.
 //! - `alarms`: alarms, their order and what suppresses them.
 //! - `addresses`, `network`: what must not happen twice among nodes.
 //! - `order`: causes before consequences. `problems`: where messages are collected.
@@ -10,6 +10,7 @@
 
 mod addresses;
 mod alarms;
+mod boot;
 mod derived;
 mod fields;
 mod items;

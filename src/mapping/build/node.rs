@@ -4,11 +4,14 @@ use std::time::Duration;
 
 use super::super::At;
 use super::super::SourceText;
-use super::super::file::{MappingFile, TpdoSection};
+use super::super::file::{MappingFile, TagSection, TpdoSection};
 use super::super::installation::ErrorControlWord;
+use super::boot;
 use super::problems::Problems;
 use super::tags::Context;
 use crate::canopen::boot::BootSettings;
+use crate::canopen::object::{MappedObject, ObjectId};
+use crate::canopen::sdo::SdoSettings;
 use crate::canopen::{ErrorControl, GuardingSettings, NodeId, NodeSettings, PdoSettings, StartSettings};
 
 /// A node that has shown no frame for so long after the start is reported (R-DET-001).
@@ -19,6 +22,8 @@ const LONGEST_PERIOD: u64 = 3_600_000;
 /// The settings of a node.
 pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> NodeSettings {
     let error_control = error_control(problems, context);
+    let steps = boot::steps(problems, context);
+    let polls = boot::polls(problems, context);
     let pdos = context.tpdos.iter().map(|tpdo| {
         let pdo = pdo(problems, context, id, tpdo.key, tpdo.section);
         if pdo.timeout.is_none() {
@@ -31,8 +36,9 @@ pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> N
         pdos: pdos.collect(),
         error_control,
         start: start(problems, context),
-        sdo: None,
-        boot: BootSettings::default(),
+        sdo: (!steps.is_empty() || !polls.is_empty()).then(SdoSettings::default),
+        boot: BootSettings { steps, ..BootSettings::default() },
+        polls,
         never_seen_after: NEVER_SEEN_AFTER,
     }
 }
@@ -165,7 +171,7 @@ fn pdo(
         let message = format!("`{}` is not the number of a TPDO", key.value);
         problems.error(source, &key.span, message, "write [tpdo.1] to [tpdo.512]");
     }
-    let length = problems.within(source, &tpdo.length, "length", 1..=8);
+    let length = checked_length(problems, source, key, tpdo);
     let millis = |problems: &mut Problems, at: &Option<At<u64>>, what: &str| {
         at.as_ref().map(|at| Duration::from_millis(problems.within(source, at, what, 1..=LONGEST_PERIOD)))
     };
@@ -174,7 +180,7 @@ fn pdo(
     let timeout = either(context, context.entry.pdo_timeout_ms.as_ref(), tpdo.timeout_ms.as_ref());
     let timeout = match timeout {
         Some((_, at)) if at.value == 0 => None,
-        None => period.map(|period| 3 * period),
+        None => period.or(event_timer(tpdo)).map(|period| 3 * period),
         Some((source, at)) => {
             Some(Duration::from_millis(problems.within(source, at, "timeout", 10..=LONGEST_PERIOD)))
         }
@@ -198,6 +204,72 @@ fn pdo(
         timeout,
         shortest_period,
     }
+}
+
+/// The event timer, where it runs.
+fn event_timer(tpdo: &TpdoSection) -> Option<Duration> {
+    tpdo.event_timer_ms.as_ref().map(|at| Duration::from_millis(at.value)).filter(|timer| !timer.is_zero())
+}
+
+/// The bytes of a TPDO, from what it maps or as they are written.
+pub fn length(tpdo: &TpdoSection) -> Option<u64> {
+    let bits: u64 =
+        tpdo.maps.iter().filter_map(|entry| mapped(&entry.value)).map(|each| u64::from(each.bits)).sum();
+    if tpdo.maps.is_empty() { tpdo.length.as_ref().map(|at| at.value) } else { Some(bits.div_ceil(8)) }
+}
+
+fn checked_length(problems: &mut Problems, source: &SourceText, key: &At<String>, tpdo: &TpdoSection) -> u64 {
+    for entry in &tpdo.maps {
+        if mapped(&entry.value).is_none() {
+            let message = format!("`{}` is no mapped object", entry.value);
+            problems.error(source, &entry.span, message, "write index, sub-index and bits: \"0x6130:1/32\"");
+        }
+    }
+    let span = tpdo.maps.first().map(|entry| &entry.span).or(tpdo.length.as_ref().map(|at| &at.span));
+    let Some((length, span)) = length(tpdo).zip(span) else {
+        let hint = "give it `length`, or `maps`";
+        problems.error(source, &key.span, format!("the length of TPDO {} is not known", key.value), hint);
+        return 8;
+    };
+    problems.within(source, &At { value: length, span: span.clone() }, "length", 1..=8)
+}
+
+/// `0x6130:1/32`.
+pub fn mapped(text: &str) -> Option<MappedObject> {
+    let (object, bits) = text.split_once('/')?;
+    let bits: u8 = bits.parse().ok().filter(|bits| (1..=64).contains(bits))?;
+    Some(MappedObject { object: object.parse().ok()?, bits })
+}
+
+/// An object by its text.
+pub fn object(problems: &mut Problems, source: &SourceText, text: &At<String>) -> Option<ObjectId> {
+    match text.value.parse::<ObjectId>() {
+        Ok(object) => Some(object),
+        Err(error) => {
+            problems.error(source, &text.span, error.to_string(), "for example \"0x6130:1\"");
+            None
+        }
+    }
+}
+
+/// Where an object stands in a TPDO.
+pub fn bit_of(tpdo: &TpdoSection, object: ObjectId) -> Option<u64> {
+    let mut bit = 0;
+    for entry in &tpdo.maps {
+        let entry = mapped(&entry.value)?;
+        if entry.object == object {
+            return Some(bit);
+        }
+        bit += u64::from(entry.bits);
+    }
+    None
+}
+
+/// The object and period of a tag that no TPDO maps.
+pub fn polled<'a>(context: &Context<'_>, section: &'a TagSection) -> Option<(ObjectId, &'a At<u64>)> {
+    let object = section.object.as_ref()?.value.parse().ok()?;
+    let in_pdo = context.tpdos.iter().any(|tpdo| bit_of(tpdo.section, object).is_some());
+    Some((object, section.poll_ms.as_ref()?)).filter(|_| !in_pdo)
 }
 
 /// One TPDO of a mapping.

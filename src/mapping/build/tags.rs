@@ -189,9 +189,14 @@ fn from_pdo(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, sec
             fields::check_byte_order(problems, context.config, &order.span, &item.name, field);
         }
     }
+    let poll = fields::poll(context, item).zip(fields::whole(section));
     let scaled = scale != Scale::IDENTITY || field.kind == FieldKind::Float;
     let usual_decimals = if scaled { 2 } else { 0 };
-    finished(problems, context, item, section.shared(), usual_decimals, Source::Pdo { pdo, field, scale })
+    let source = match poll {
+        Some((poll, field)) => Source::Polled { poll, field, scale },
+        None => Source::Pdo { pdo, field, scale },
+    };
+    finished(problems, context, item, section.shared(), usual_decimals, source)
 }
 
 fn scale(problems: &mut Problems, context: &Context<'_>, section: Option<&At<ScaleSection>>) -> Scale {

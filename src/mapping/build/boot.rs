@@ -1,0 +1,105 @@
+//! What is done with a node before it is started, and which of its objects are read again and again.
+
+use std::time::Duration;
+
+use super::super::At;
+use super::super::file::{MappingWord, SetupSection, SetupValue};
+use super::items::Entry;
+use super::node;
+use super::problems::Problems;
+use super::tags::Context;
+use crate::canopen::PdoIndex;
+use crate::canopen::boot::{BootStep, MappingMode, PdoSetup};
+use crate::canopen::object::{DataType, ObjectId};
+use crate::canopen::polls::Poll;
+
+/// Producer heartbeat time.
+const HEARTBEAT: ObjectId = ObjectId::new(0x1017, 0);
+
+/// The steps of the boot, in the order of CiA 302-2: identity, error control, PDOs, configuration.
+pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
+    let mut steps = identity(problems, context);
+    if let Some(at) = &context.file.error_control.heartbeat_ms {
+        let millis = problems.within(context.source, at, "heartbeat_ms", 10..=65_535);
+        let data = u16::try_from(millis).unwrap_or(u16::MAX).to_le_bytes().to_vec();
+        steps.push(BootStep::Write { object: HEARTBEAT, data, optional: false });
+    }
+    let setups = context.file.setup.iter().filter_map(|section| setup(problems, context, section));
+    steps.extend(setups);
+    for (place, tpdo) in context.tpdos.iter().enumerate() {
+        let section = tpdo.section;
+        let mode = match section.mapping {
+            _ if section.maps.is_empty() => continue,
+            MappingWord::Fixed => continue,
+            MappingWord::Write => MappingMode::Write,
+            MappingWord::Verify => MappingMode::Verify,
+        };
+        let mut number = |at: &Option<At<u64>>, what: &str, highest: u64| {
+            at.as_ref().map(|at| problems.within(context.source, at, what, 0..=highest))
+        };
+        let transmission_type = number(&section.transmission_type, "transmission_type", 255);
+        let event_timer = number(&section.event_timer_ms, "event_timer_ms", 65_535);
+        let inhibit_time = number(&section.inhibit_time_us, "inhibit_time_us", 6_553_500);
+        steps.push(BootStep::Pdo(PdoSetup {
+            pdo: PdoIndex(place),
+            number: u16::try_from(tpdo.number).unwrap_or_default(),
+            mode,
+            maps: section.maps.iter().filter_map(|entry| node::mapped(&entry.value)).collect(),
+            transmission_type: transmission_type.and_then(|number| u8::try_from(number).ok()),
+            inhibit_time: inhibit_time.and_then(|micros| u16::try_from(micros / 100).ok()),
+            event_timer: event_timer.and_then(|millis| u16::try_from(millis).ok()),
+            set_invalid: section.set_pdo_invalid,
+        }));
+    }
+    steps
+}
+
+fn identity(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
+    let Some(identity) = &context.file.identity else { return Vec::new() };
+    let keys = [
+        (&identity.device_type, ObjectId::new(0x1000, 0), "device_type"),
+        (&identity.vendor_id, ObjectId::new(0x1018, 1), "vendor_id"),
+        (&identity.product_code, ObjectId::new(0x1018, 2), "product_code"),
+        (&identity.revision_number, ObjectId::new(0x1018, 3), "revision_number"),
+    ];
+    let steps = keys.into_iter().filter_map(|(at, object, what)| {
+        let expected = problems.within(context.source, at.as_ref()?, what, 0..=u64::from(u32::MAX));
+        Some(BootStep::Identity { object, expected: u32::try_from(expected).ok()? })
+    });
+    steps.collect()
+}
+
+fn setup(problems: &mut Problems, context: &Context<'_>, section: &SetupSection) -> Option<BootStep> {
+    let source = context.source;
+    let object = node::object(problems, source, &section.object)?;
+    let Ok(kind) = section.kind.value.parse::<DataType>() else {
+        let message = format!("there is no type `{}`", section.kind.value);
+        problems.error(source, &section.kind.span, message, "use u8 to u64, i8 to i64, f32 or f64");
+        return None;
+    };
+    let text = match section.value.value {
+        SetupValue::Whole(number) => number.to_string(),
+        SetupValue::Real(number) => number.to_string(),
+    };
+    match kind.encode(&text) {
+        Ok(data) => Some(BootStep::Write { object, data, optional: section.optional }),
+        Err(error) => {
+            problems.error(source, &section.value.span, error.to_string(), "check `type` and `value`");
+            None
+        }
+    }
+}
+
+/// The objects that tags name and that no TPDO maps, in the order of the file.
+pub fn polls(problems: &mut Problems, context: &Context<'_>) -> Vec<Poll> {
+    let mut polls = Vec::new();
+    for item in &context.items.list {
+        let Entry::Tag(section) = item.entry else { continue };
+        let Some((object, at)) = node::polled(context, section) else { continue };
+        let millis = problems.within(context.source, at, "poll_ms", 100..=86_400_000);
+        let bits = super::fields::whole(section).map_or(8, |field| field.width);
+        let length = usize::from(bits.div_ceil(8));
+        polls.push(Poll { object, period: Duration::from_millis(millis), length });
+    }
+    polls
+}
