@@ -58,6 +58,7 @@
 //! | a data type or scaling rule | `mapping/codec.rs`, `mapping/build/fields.rs` |
 //! | a derived tag | `mapping/table.rs` ([`mapping::Derived`]), `mapping/file.rs`, `mapping/build/derived.rs`, `gateway/derived.rs`, `modbus/source.rs` |
 //! | an alarm that needs the gateway's own eyes | [`mapping::BuiltIn`], `mapping/builtin.rs`, `gateway/conditions.rs` |
+//! | a simulated device | a folder in `simulator/`, a variant in `simulator/kind.rs` and in `cli/args.rs` |
 //! | a northbound | a new room; one field in `config`; one spawn in `supervisor` |
 
 pub mod alarms;

@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
-use cangate::canopen::NmtState;
+use cangate::canopen::{NmtState, NodeId};
 use cangate::process_image::{Quality, Value};
+use cangate::simulator::{DevicePlan, Kind, Scenario};
 
 use super::support::world::{Weather, World};
 
@@ -313,4 +314,15 @@ fn whatever_happens_the_gateway_sends_nothing_but_guard_requests_and_starts() {
         world.run_for(7000);
     }
     assert_eq!(world.sent.iter().collect::<Vec<_>>(), ["000#0101", "000#0102", "701#R1", "702#R1"]);
+}
+
+#[test]
+fn a_device_of_another_kind_on_the_same_bus_disturbs_nobody() {
+    let mut world = World::running(1);
+    let scenario = Scenario::shipped(Kind::DstP92c, "demo").unwrap();
+    world.connect(&DevicePlan::new(NodeId::new(5).unwrap(), scenario));
+    world.order("node 5 set 1017 0 500");
+    world.run_for(60_000);
+    assert!(world.is_good(1) && world.raised.is_empty(), "{:?}", world.raised);
+    assert_eq!(world.sent.iter().collect::<Vec<_>>(), ["000#0101", "701#R1"]);
 }

@@ -268,6 +268,8 @@ fn print_reports(mut to: impl Write, mut reports: mpsc::Receiver<String>) {
 mod tests {
     use std::io::Cursor;
 
+    use clap::ValueEnum;
+
     use super::*;
     use crate::can::virtual_bus;
     use crate::can::{BusEvent, BusReader, BusWriter};
@@ -336,6 +338,17 @@ mod tests {
         let error = with("unheard_of").unwrap_err();
         assert_eq!(error.exit(), Exit::Io);
         assert!(error.to_string().contains("knock_cylinder_7"), "{error}");
+    }
+
+    #[test]
+    fn the_devices_of_the_command_line_are_those_of_the_simulator() {
+        let typed: Vec<_> =
+            SimDevice::value_variants().iter().filter_map(SimDevice::to_possible_value).collect();
+        let typed: Vec<_> = typed.iter().map(clap::builder::PossibleValue::get_name).collect();
+        assert_eq!(typed, Kind::ALL.map(Kind::word));
+        for kind in Kind::ALL {
+            assert_eq!(plan(&SimOptions { kind, ..options() }).unwrap()[0].scenario.settings.kind(), kind);
+        }
     }
 
     #[test]

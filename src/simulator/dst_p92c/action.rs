@@ -57,7 +57,7 @@ pressure BAR [MS]|off         the pressure, at once or within MS milliseconds; o
 temperature C|off             the temperature
 sensor 1|2 bad|good           a sensor is broken: 1 pressure, 2 temperature
 emcy CODE|clear               an error with this code (hex), until `emcy clear`
-mute sdo|heartbeat|emcy|pdo on|off   it is not sent
+mute VOICE on|off             sdo, heartbeat, emcy or pdo is not sent
 late sdo MS|off               SDO answers come so much later
 abort INDEX SUB CODE|off      each SDO access to this entry fails with this code (all hex)
 boot error on|off             the device finds an error whenever it starts

@@ -116,14 +116,18 @@ impl Device for SimulatedDst {
     }
 
     fn status(&self) -> Status {
-        let error = if self.dst.state().is_some() { self.dst.error() } else { 0 };
-        let remarks = [
-            (error != 0, format!("error {error:04X}")),
-            (self.dst.lss.is_in_configuration(), "lss configuration".to_owned()),
-            (!self.dst.is_on_the_air(), "not at the bit rate of the bus".to_owned()),
-        ];
-        let remarks = remarks.into_iter().filter(|(holds, _)| *holds).map(|(_, remark)| remark);
-        Status { state: self.dst.state(), remarks: remarks.collect() }
+        let (state, error) = (self.dst.state(), self.dst.error());
+        let mut remarks = Vec::new();
+        if state.is_some() && error != 0 {
+            remarks.push(format!("error {error:04X}"));
+        }
+        if self.dst.lss.is_in_configuration() {
+            remarks.push("lss configuration".to_owned());
+        }
+        if !self.dst.is_on_the_air() {
+            remarks.push("not at the bit rate of the bus".to_owned());
+        }
+        Status { state, remarks }
     }
 
     fn hears(&self, id: CanId) -> bool {
