@@ -121,24 +121,25 @@ pub(super) fn command(arguments: &SimArguments) -> Exit {
         scenario: arguments.scenario.clone(),
         seed: arguments.seed,
     };
+    if let Err(error) = check_company(&options.interface) {
+        return refuse(&error);
+    }
     block_on(async {
         let stop = CancellationToken::new();
         if let Err(error) = shutdown::on_signal(stop.clone()) {
             print_error(&format!("signals cannot be handled: {error}"));
             return Exit::Io;
         }
-        let ended = async {
-            check_company(&options.interface)?;
-            run(options, orders(), io::stdout(), Clock::start(), stop).await
-        };
-        match ended.await {
+        match run(options, orders(), io::stdout(), Clock::start(), stop).await {
             Ok(()) => Exit::Ok,
-            Err(error) => {
-                print_error(&error.to_string());
-                error.exit()
-            }
+            Err(error) => refuse(&error),
         }
     })
+}
+
+fn refuse(error: &SimError) -> Exit {
+    print_error(&error.to_string());
+    error.exit()
 }
 
 /// A simulator is for somebody else on the bus.
@@ -360,6 +361,15 @@ mod tests {
             "{error}"
         );
         assert!(check_company(&"vcan0".parse().unwrap()).is_ok());
+        let arguments = SimArguments {
+            device: SimDevice::Detcon,
+            interface: options().interface,
+            node: 1,
+            count: 1,
+            scenario: None,
+            seed: 1,
+        };
+        assert_eq!(command(&arguments), Exit::Usage);
     }
 
     #[test]
