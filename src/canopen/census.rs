@@ -126,6 +126,15 @@ impl NodeRecord {
             || self.tpdos.iter().any(|tpdo| tpdo.count > 0)
     }
 
+    /// Whether there was any frame of it, or to it, but for ours.
+    #[must_use]
+    pub fn is_seen(&self) -> bool {
+        self.is_heard()
+            || self.guard_requests.count > 0
+            || self.sdo_requests > 0
+            || self.rpdos.iter().any(|rpdo| rpdo.count > 0)
+    }
+
     /// The TPDOs that were seen: number 1..=4, traffic.
     pub fn seen_tpdos(&self) -> impl Iterator<Item = (u16, &Traffic)> {
         (1..).zip(&self.tpdos).filter(|(_, tpdo)| tpdo.count > 0)

@@ -7,6 +7,7 @@ use clap::{Args, Parser, ValueEnum};
 use clap_complete::Shell;
 
 use super::health::Url;
+use super::lss_args::LssArguments;
 use super::schema::Schema;
 use super::tool_args::{InitArguments, NmtArguments, ScanArguments, SdoArguments};
 use crate::can::interface::Interface;
@@ -65,6 +66,8 @@ pub enum Subcommand {
     Nmt(NmtArguments),
     /// Read or write an object of a node.
     Sdo(SdoArguments),
+    /// Find devices by their LSS address, give them node ids and bit rates.
+    Lss(LssArguments),
 }
 
 /// `cangate run`

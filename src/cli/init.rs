@@ -197,9 +197,9 @@ fn node_name(mapping: &str, id: u8) -> String {
     if is_name(&name) { name } else { format!("node-{id}") }
 }
 
-/// A TOML string.
+/// A TOML string on one line. TOML escapes as JSON does, and DEL as well.
 fn quoted(text: &str) -> String {
-    toml::Value::String(text.to_owned()).to_string()
+    serde_json::Value::from(text).to_string().replace('\u{7F}', "\\u007F")
 }
 
 /// A text that stays within one comment.

@@ -11,6 +11,9 @@ mod health;
 mod import;
 mod init;
 mod load;
+mod lss;
+mod lss_args;
+mod lss_job;
 mod man;
 mod map;
 mod nmt;
@@ -105,6 +108,7 @@ fn dispatch(command: Subcommand) -> Exit {
         Subcommand::Init(options) => init::run(&options),
         Subcommand::Nmt(options) => nmt::run(&options),
         Subcommand::Sdo(options) => sdo::run(&options),
+        Subcommand::Lss(options) => lss::run(&options),
     }
 }
 
@@ -149,6 +153,9 @@ mod tests {
             &["nmt", "-i", "can0", "start", "1"],
             &["nmt", "-i", "can0", "reset-node", "all", "--yes"],
             &["sdo", "-i", "can0", "--node", "1", "read", "0x1000:0"],
+            &["lss", "-i", "can0", "scan", "--vendor", "0x23D", "--product", "1"],
+            &["lss", "-i", "can0", "set-node-id", "--node", "1", "--to", "5", "--bit-rate", "250"],
+            &["lss", "-i", "can0", "inquire", "--only-one-device"],
             &["sdo", "-i", "can0", "--node", "1", "write", "0x6124:1", "-1.5", "--type", "f32"],
         ] {
             let line = std::iter::once("cangate").chain(words.iter().copied());

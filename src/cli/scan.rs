@@ -129,7 +129,7 @@ impl Survey {
             let record = self.census.nodes.get(&id).unwrap_or(&nothing);
             let identity = self.identities.get(&id);
             // Nodes that we asked, and of which nothing came.
-            if *record == NodeRecord::default() && identity.is_none() {
+            if !record.is_seen() && identity.is_none() {
                 return None;
             }
             let found = candidates(&sighting(id, record, identity), SHIPPED);
