@@ -297,7 +297,8 @@ impl Probe {
                 frames.retain(|frame| frame.id() != super::sdo::request_id(node));
                 self.silent.push_back(node);
             } else {
-                let identity = Identity { device_type: result.ok().and_then(number), ..Identity::default() };
+                let identity =
+                    Identity { device_type: result.ok().as_deref().and_then(number), ..Identity::default() };
                 self.answered.push_back((node, client, identity));
             }
         }
@@ -318,7 +319,7 @@ impl Probe {
         let gone = matches!(result, Err(SdoError::Timeout { .. } | SdoError::BusUnavailable));
         if let Ok(bytes) = result {
             match reading.identity.identity.get_mut(reading.done) {
-                Some(place) => *place = number(bytes),
+                Some(place) => *place = number(&bytes),
                 None => reading.identity.name = DataType::VisibleString.decode(&bytes).ok(),
             }
         }
@@ -357,7 +358,7 @@ impl Probe {
 }
 
 /// A number of up to four bytes.
-fn number(bytes: Vec<u8>) -> Option<u32> {
+fn number(bytes: &[u8]) -> Option<u32> {
     (bytes.len() <= 4).then(|| bytes.iter().rev().fold(0, |value, byte| value << 8 | u32::from(*byte)))
 }
 

@@ -24,7 +24,7 @@ fn run(mut probe: Probe, answers: &Answers) -> (Vec<(u64, String)>, Vec<ProbeOut
                         answers.get(&frame.to_string()).map(|text| text.parse::<CanFrame>().unwrap()),
                     );
                 }
-                other => told.push(other),
+                output @ (ProbeOutput::Found(..) | ProbeOutput::Done { .. }) => told.push(output),
             }
         }
         for frame in &arrived {
@@ -33,7 +33,6 @@ fn run(mut probe: Probe, answers: &Answers) -> (Vec<(u64, String)>, Vec<ProbeOut
         }
         if arrived.is_empty() {
             let Some(due) = probe.poll_timeout() else { return (frames, told) };
-            assert!(due > now || due == now && !told.is_empty() || due == now, "time stands still");
             now = now.max(due);
             probe.handle_timeout(now);
         }

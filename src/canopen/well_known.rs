@@ -18,8 +18,9 @@ pub fn data_type(object: ObjectId) -> Option<DataType> {
 fn lookup(object: ObjectId) -> Option<(&'static str, DataType)> {
     let ObjectId { index, sub } = object;
     Some(match (index, sub) {
-        (0x1003 | 0x1010 | 0x1011 | 0x1016 | 0x1018, 0) => ("number of entries", DataType::U8),
-        (0x1200..=0x13FF | 0x1400..=0x1BFF, 0) => ("number of entries", DataType::U8),
+        (0x1003 | 0x1010 | 0x1011 | 0x1016 | 0x1018 | 0x1020 | 0x1200..=0x1BFF, 0) => {
+            ("number of entries", DataType::U8)
+        }
         (0x1400..=0x15FF | 0x1800..=0x19FF, _) => return pdo_parameter(sub),
         (0x1600..=0x17FF | 0x1A00..=0x1BFF, 1..=64) => ("mapped object", DataType::U32),
         (0x1200..=0x12FF, 1) => ("COB-ID client to server", DataType::U32),
@@ -49,7 +50,6 @@ fn lookup(object: ObjectId) -> Option<(&'static str, DataType)> {
         (0x1018, 3) => ("revision number", DataType::U32),
         (0x1018, 4) => ("serial number", DataType::U32),
         (0x1019, 0) => ("synchronous counter overflow value", DataType::U8),
-        (0x1020, 0) => ("number of entries", DataType::U8),
         (0x1020, 1) => ("configuration date", DataType::U32),
         (0x1020, 2) => ("configuration time", DataType::U32),
         (0x1F80, 0) => ("NMT start-up", DataType::U32),

@@ -71,9 +71,10 @@ fn write_configuration(report: &ScanReport, arguments: &InitArguments) -> Exit {
         }
     }
     if let Err(error) = write(&arguments.output, &text, arguments.force) {
-        print_error(&match error.kind() {
-            io::ErrorKind::AlreadyExists => exists(&arguments.output),
-            _ => format!("cannot write {}: {error}", arguments.output.display()),
+        print_error(&if error.kind() == io::ErrorKind::AlreadyExists {
+            exists(&arguments.output)
+        } else {
+            format!("cannot write {}: {error}", arguments.output.display())
         });
         return Exit::Io;
     }

@@ -9,6 +9,7 @@ use super::output::{block_on, print_error, print_line};
 use super::session::{Session, SessionError, check_company};
 use crate::can::interface::Interface;
 use crate::canopen::lss::{LssAddress, LssAnswer, LssError, LssJob, LssKnown, LssState};
+use crate::supervisor::shutdown;
 use crate::time::Clock;
 
 /// Does what is asked and prints what came of it.
@@ -21,8 +22,13 @@ pub(super) fn run(arguments: &LssArguments) -> Exit {
         }
     };
     block_on(async {
+        let stop = CancellationToken::new();
+        if let Err(error) = shutdown::on_signal(stop.clone()) {
+            print_error(&format!("signals cannot be handled: {error}"));
+            return Exit::Io;
+        }
         let done = match check_company(&arguments.interface) {
-            Ok(()) => perform(&arguments.interface, task, Clock::start()).await,
+            Ok(()) => perform(&arguments.interface, task, Clock::start(), stop).await,
             Err(error) => Err(error),
         };
         match done {
@@ -83,10 +89,18 @@ async fn perform(
     interface: &Interface,
     mut task: LssTask,
     clock: Clock,
+    stop: CancellationToken,
 ) -> Result<Result<Vec<LssAnswer>, LssError>, SessionError> {
+    // A signal does not end the session: a device must not be left stopped, or in configuration state.
     let mut session = Session::open(interface, false, clock, CancellationToken::new()).await?;
     task.begin(clock.now().instant);
-    let result = session.run(&mut task).await?;
+    let result = tokio::select! {
+        done = session.run(&mut task) => done?,
+        () = stop.cancelled() => {
+            task.cancel(clock.now().instant);
+            session.run(&mut task).await?
+        }
+    };
     // A last frame has still to leave; the result says already what counts.
     let _ = session.close().await;
     Ok(result)

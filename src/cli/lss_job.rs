@@ -12,7 +12,7 @@ use super::session::{Machine, Step};
 use crate::can::CanFrame;
 use crate::canopen::census::Census;
 use crate::canopen::lss::{
-    LssAddress, LssAnswer, LssChange, LssDuty, LssError, LssJob, LssMaster, LssOutput, LssSettings,
+    LssAddress, LssAnswer, LssChange, LssDuty, LssError, LssJob, LssMaster, LssOutput, LssSettings, LssState,
     LssTarget, Performed,
 };
 use crate::canopen::object::ObjectId;
@@ -36,6 +36,8 @@ pub(super) struct LssTask {
     master: LssMaster,
     jobs: VecDeque<LssJob>,
     answers: Vec<LssAnswer>,
+    /// Why a job failed.
+    failed: Option<LssError>,
     /// A change whose address is to be read by SDO first.
     of_node: Option<(LssChange, NodeId)>,
     /// Node ids of the change, before and after.
@@ -82,6 +84,7 @@ impl LssTask {
             master: LssMaster::new(LssSettings::default()),
             jobs: jobs.into(),
             answers: Vec::new(),
+            failed: None,
             of_node: None,
             node,
             new_node,
@@ -122,12 +125,34 @@ impl LssTask {
             self.read_identity(now, node, 1);
         } else if let Some(job) = self.jobs.pop_front() {
             if let Err(error) = self.master.request(now, job) {
+                let error = self.failed.take().unwrap_or(error);
                 self.end(Err(error));
             }
         } else {
             let answers = std::mem::take(&mut self.answers);
-            self.end(Ok(answers));
+            let outcome = self.failed.take().map_or(Ok(answers), Err);
+            self.end(outcome);
         }
+    }
+
+    /// Of the jobs that are left only the way out of configuration state is gone.
+    fn fail(&mut self, now: Instant, error: LssError) {
+        let leave = |job: &LssJob| matches!(job, LssJob::SwitchGlobal { state: LssState::Waiting, .. });
+        self.jobs.retain(leave);
+        self.failed.get_or_insert(error);
+        self.next_job(now);
+    }
+
+    /// Gives up; a change goes back as far as it can before it ends.
+    pub(super) fn cancel(&mut self, now: Instant) {
+        (self.duty, self.sdo, self.listen_until, self.of_node) = (Duty::Nothing, None, None, None);
+        if self.master.is_idle() {
+            self.jobs.clear();
+            self.end(Err(LssError::Cancelled));
+        } else {
+            self.master.cancel(now);
+        }
+        self.drain(now);
     }
 
     fn end(&mut self, outcome: Outcome) {
@@ -156,19 +181,19 @@ impl LssTask {
                 self.sent = now;
                 self.outputs.push_back(Step::Transmit(frame));
             }
-            LssOutput::Perform(duty) => self.perform(now, duty),
+            LssOutput::Perform(duty) => self.perform(now, &duty),
             // The answer has them all.
             LssOutput::Found(_) => {}
             LssOutput::Done(Ok(answer)) => {
                 self.answers.push(answer);
                 self.next_job(now);
             }
-            LssOutput::Done(Err(error)) => self.end(Err(error)),
+            LssOutput::Done(Err(error)) => self.fail(now, error),
         }
     }
 
-    fn perform(&mut self, now: Instant, duty: LssDuty) {
-        match duty {
+    fn perform(&mut self, now: Instant, duty: &LssDuty) {
+        match *duty {
             LssDuty::ReadHeartbeat(node) => {
                 self.duty = Duty::ReadHeartbeat;
                 self.ask(now, node, SdoRequest::read(HEARTBEAT).of_len(2));

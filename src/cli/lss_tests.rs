@@ -14,10 +14,10 @@ use crate::time::{Instant, Now};
 
 fn arguments(words: &str) -> LssArguments {
     let line = ["cangate", "lss", "-i", "can0"].into_iter().chain(words.split(' '));
-    match CommandLine::try_parse_from(line).unwrap().command {
-        Subcommand::Lss(arguments) => arguments,
-        other => panic!("{other:?}"),
-    }
+    let Subcommand::Lss(arguments) = CommandLine::try_parse_from(line).unwrap().command else {
+        panic!("{words}");
+    };
+    arguments
 }
 
 /// What a device answers; an answer that is several frames has spaces between them.
@@ -186,6 +186,46 @@ fn r_dst_104_105_the_only_device_is_asked_for_its_address_and_node_id() {
         Some("7E5#0400000000000000"),
         "no device stays in configuration state"
     );
+}
+
+#[test]
+fn a_device_that_does_not_answer_an_inquiry_is_told_to_leave_configuration_state_all_the_same() {
+    let (sent, outcome) = run("inquire --only-one-device", &Device::new(), &[]);
+    assert!(matches!(outcome, Err(LssError::NoAnswer { .. })), "{outcome:?}");
+    assert_eq!(sent, ["7E5#0401000000000000", "7E5#5A00000000000000", "7E5#0400000000000000"]);
+}
+
+#[test]
+fn a_change_that_is_cancelled_goes_back_as_far_as_it_can() {
+    let mut task = task(&arguments("set-node-id --node 1 --to 5")).unwrap();
+    task.begin(Instant::START);
+    task.handle_frame(Now::from_millis(1), &"701#05".parse().unwrap());
+    let device = dst();
+    let mut sent: Vec<String> = Vec::new();
+    let mut now = 1;
+    let outcome = loop {
+        match task.poll_output() {
+            Some(Step::Transmit(frame)) => {
+                sent.push(frame.to_string());
+                now += 1;
+                if sent.last().is_some_and(|last| last == "7E5#1105000000000000") {
+                    task.cancel(Instant::from_millis(now));
+                } else if let Some(answer) = device.get(frame.to_string().as_str()) {
+                    task.handle_frame(Now::from_millis(now), &answer.parse().unwrap());
+                } else if frame.to_string() == "601#2B171000F4010000" {
+                    task.handle_frame(Now::from_millis(now), &"581#6017100000000000".parse().unwrap());
+                }
+            }
+            Some(Step::Done(outcome)) => break outcome,
+            None => {
+                now = task.poll_timeout().expect("something to wait for").as_micros().div_ceil(1000).max(now);
+                task.handle_timeout(Now::from_millis(now));
+            }
+        }
+    };
+    assert_eq!(outcome, Err(LssError::Cancelled));
+    let end: Vec<&str> = sent.iter().rev().take(3).rev().map(String::as_str).collect();
+    assert_eq!(end, ["7E5#0400000000000000", "000#0101", "601#2B171000F4010000"], "{sent:#?}");
 }
 
 #[test]

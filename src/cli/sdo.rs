@@ -174,8 +174,8 @@ fn readings(bytes: &[u8], data_type: Option<DataType>) -> String {
     if let Some(data_type) = data_type {
         match data_type.decode(bytes) {
             Ok(text) if is_unsigned(data_type) => {
-                let digits: String = bytes.iter().rev().map(|byte| format!("{byte:02X}")).collect();
-                return format!("{text}  0x{digits}  ({data_type})");
+                let digits: Vec<String> = bytes.iter().rev().map(|byte| format!("{byte:02X}")).collect();
+                return format!("{text}  0x{}  ({data_type})", digits.concat());
             }
             Ok(text) => return format!("{text}  ({data_type})"),
             Err(error) => return format!("{hex}  ({error}; {})", guesses(bytes)),

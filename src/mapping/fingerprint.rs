@@ -4,6 +4,7 @@
 //! TPDOs, how its life is watched, and where the node told its name, the model. Devices without an identity object can be
 //! told apart only so; therefore an answer is a proposal, which says on what it rests.
 
+use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::{DeviceDef, Sketch, SourceText};
@@ -52,7 +53,7 @@ pub struct Candidate {
 pub fn candidates(sighting: &Sighting, mappings: &[(&str, &str)]) -> Vec<Candidate> {
     let mut found: Vec<Candidate> =
         mappings.iter().filter_map(|(name, text)| candidate(sighting, name, text)).collect();
-    found.sort_by(|a, b| b.fit.cmp(&a.fit));
+    found.sort_by_key(|candidate| Reverse(candidate.fit));
     found
 }
 
