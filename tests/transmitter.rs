@@ -12,8 +12,8 @@ use super::support::world::World;
 
 /// A `DetCon` at node 1 and a transmitter at node 2.
 fn plant() -> Arc<TagTable> {
-    let sketch = Sketch::new().node("engine1", 1, "motortech-detcon", |_| ()).node(
-        "hydraulics",
+    let sketch = Sketch::new().node("node001", 1, "motortech-detcon", |_| ()).node(
+        "node002",
         2,
         "danfoss-dst-p92c",
         |_| (),
@@ -108,7 +108,7 @@ fn r_dst_026_a_broken_sensor_makes_its_value_meaningless_and_raises_an_alarm() {
 #[test]
 fn r_dst_001_another_device_at_its_place_is_not_started_and_said_to_be_another() {
     let mut world = World::with(
-        Arc::new(Sketch::new().node("hydraulics", 1, "danfoss-dst-p92c", |_| ()).build().unwrap().0),
+        Arc::new(Sketch::new().node("node001", 1, "danfoss-dst-p92c", |_| ()).build().unwrap().0),
         1,
     );
     world.power_on(1, "quiet");

@@ -27,6 +27,11 @@ impl Heartbeat {
         Self { timeout, deadline: None, watching: false, lost: false }
     }
 
+    /// How long the node may be silent.
+    pub(super) fn timeout(&self) -> Duration {
+        self.timeout
+    }
+
     /// Whether the node is lost.
     pub(super) fn is_lost(&self) -> bool {
         self.lost

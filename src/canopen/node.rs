@@ -474,7 +474,12 @@ impl Node {
                     self.polls.begin(now);
                 }
                 if let Some(start) = self.start.as_mut().filter(|_| done) {
-                    start.handle_boot_done(now, self.state == Some(NmtState::Operational));
+                    // A node that runs already will say so: it is not started for nothing.
+                    let wait = match &self.watch {
+                        Watch::Heartbeat(heartbeat) if self.state.is_none() => heartbeat.timeout(),
+                        Watch::Heartbeat(_) | Watch::Guarding(_) | Watch::Nothing => Duration::ZERO,
+                    };
+                    start.handle_boot_done(now, self.state == Some(NmtState::Operational), wait);
                 }
             }
         }
@@ -485,7 +490,7 @@ impl Node {
         let request = NmtRequest::EnterPreOperational;
         outputs.transmit(request.frame(Some(self.id)));
         self.note_sent(now, request, outputs);
-        self.state = None;
+        self.state = Some(NmtState::PreOperational);
     }
 
     /// A guard request was not answered.

@@ -82,11 +82,12 @@ impl Start {
         self.cancel();
     }
 
-    /// The boot of the node is done: a start command is due, unless the node is operational already.
-    pub(super) fn handle_boot_done(&mut self, now: Instant, operational: bool) {
+    /// The boot of the node is done: a start command is due after `wait`, unless the node is operational already.
+    pub(super) fn handle_boot_done(&mut self, now: Instant, operational: bool, wait: Duration) {
         self.configured = true;
         if self.settings.auto_start && !self.held && !operational {
-            self.phase = Phase::Booting(self.quiet_until.map_or(now, |until| until.max(now)));
+            let at = now + wait;
+            self.phase = Phase::Booting(self.quiet_until.map_or(at, |until| until.max(at)));
         }
     }
 
