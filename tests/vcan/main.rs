@@ -13,6 +13,7 @@
 //! | `broker` | a broker that is killed again and again |
 //! | `socket` | the bus room alone: link states, lost frames, full queues, receive times |
 //! | `many` | two devices, two clients, a second master |
+//! | `commissioning` | scan, init, nmt, sdo: what they send, and that a scan sends nothing |
 //! | `namespace` | a gateway that reaches the bus from a network namespace of its own, as in a container |
 //!
 //! vcan0 is there once, so the tests run one after another; each begins with a new interface.
@@ -38,6 +39,7 @@
 )]
 
 mod broker;
+mod commissioning;
 mod examples;
 mod faults;
 mod guarding;
