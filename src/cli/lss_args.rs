@@ -115,7 +115,7 @@ impl AddressOptions {
 #[derive(Args, Clone, Copy, Debug)]
 pub struct ChangeOptions {
     /// Its present node id. Unless its address is given, its identity is read there by SDO, and only the device of that
-    /// address obeys.
+    /// address obeys. Without it ALL nodes of the bus are stopped while it goes on.
     #[arg(long, value_name = "OLD", value_parser = node_id)]
     pub node: Option<NodeId>,
     /// Its address.
