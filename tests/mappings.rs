@@ -244,7 +244,7 @@ const WRONG_MAPPINGS: &[(&str, &str, &[&str])] = &[
         "heartbeat_timeout_ms = 2500",
         "heartbeat_timeout = 2500",
         &[
-            "t4.toml:12:1: error: unknown key `heartbeat_timeout`\n  hint: did you mean `heartbeat_timeout_ms`? Known here: kind, guard_time_ms, life_time_factor, guard_reply_ms, toggle_check, toggle_resync, rtr_dlc, settle_ms, heartbeat_timeout_ms",
+            "t4.toml:12:1: error: unknown key `heartbeat_timeout`\n  hint: did you mean `heartbeat_timeout_ms`? Known here: kind, guard_time_ms, life_time_factor, guard_reply_ms, toggle_check, toggle_resync, rtr_dlc, settle_ms, heartbeat_ms, heartbeat_timeout_ms",
         ],
     ),
     (

@@ -23,7 +23,7 @@ pub struct Poll {
 /// The polls of one node: one at a time, in turn, and none while the node is not ready.
 #[derive(Debug)]
 pub(super) struct Polls {
-    polls: Vec<Poll>,
+    list: Vec<Poll>,
     /// When each is due; `None` while the node is not ready.
     due: Vec<Option<Instant>>,
     /// The one under way.
@@ -33,7 +33,7 @@ pub(super) struct Polls {
 impl Polls {
     /// Nothing is read before [`begin`](Self::begin).
     pub(super) fn new(polls: Vec<Poll>) -> Self {
-        Self { due: vec![None; polls.len()], polls, open: None }
+        Self { due: vec![None; polls.len()], list: polls, open: None }
     }
 
     /// Whether a transfer was asked for by a poll.
@@ -59,7 +59,7 @@ impl Polls {
             return None;
         }
         let (place, _) = self.next().filter(|(_, due)| *due <= now)?;
-        let poll = self.polls.get(place)?;
+        let poll = self.list.get(place)?;
         if let Some(due) = self.due.get_mut(place) {
             *due = Some(now + poll.period);
         }

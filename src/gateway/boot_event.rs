@@ -78,16 +78,13 @@ impl Gateway {
             return;
         };
         let carrier = CarrierIndex(def.canopen.pdos.len() + poll);
-        match result {
-            Ok(data) => {
-                let quality = node.quality_of_new_data(false);
-                self.tags.apply(&self.table, now, (index, carrier), data, quality);
-            }
-            Err(_) => {
-                self.count(index, |counters| &mut counters.sdo_errors);
-                let quality = Quality::Bad(Reason::ReadFailed);
-                self.tags.degrade(&self.table, now, index, Some(carrier), quality);
-            }
+        if let Ok(data) = result {
+            let quality = node.quality_of_new_data(false);
+            self.tags.apply(&self.table, now, (index, carrier), data, quality);
+        } else {
+            self.count(index, |counters| &mut counters.sdo_errors);
+            let quality = Quality::Bad(Reason::ReadFailed);
+            self.tags.degrade(&self.table, now, index, Some(carrier), quality);
         }
         self.dirty_nodes.mark(index.0);
     }

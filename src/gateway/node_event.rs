@@ -244,7 +244,11 @@ impl Gateway {
             }
         });
         if !operational {
-            self.degrade(now, index, None, Quality::Stale(Reason::NodeNotOperational));
+            // Objects are read in other states too.
+            let pdos = self.table.nodes.get(index.0).map_or(0, |def| def.canopen.pdos.len());
+            for pdo in (0..pdos).map(PdoIndex) {
+                self.degrade(now, index, Some(pdo), Quality::Stale(Reason::NodeNotOperational));
+            }
         }
         if !ordered {
             self.count(index, |counters| &mut counters.unexpected_states);
