@@ -3,10 +3,13 @@
 
 use std::sync::Arc;
 
+use cangate::can::{BusEvent, BusIndex, Link};
 use cangate::canopen::{NmtState, NodeId};
+use cangate::gateway::{Gateway, Input};
 use cangate::mapping::{Sketch, TagTable};
 use cangate::process_image::{Quality, Reason};
 use cangate::simulator::{DevicePlan, Kind, Scenario};
+use cangate::time::Now;
 
 use super::support::world::World;
 
@@ -116,4 +119,21 @@ fn r_dst_001_another_device_at_its_place_is_not_started_and_said_to_be_another()
     world.run_for(10_000);
     assert!(!world.sent.iter().any(|frame| frame.starts_with("000#")), "{:?}", world.sent);
     assert_eq!(world.events("node_boot_failed"), 1, "told once: it answers no SDO");
+}
+
+#[test]
+fn r_dst_034_nothing_is_shown_before_it_is_known_what_the_tpdo_carries() {
+    let table = plant();
+    let mut gateway = Gateway::new(Arc::clone(&table), Now::from_millis(0));
+    let mut image = gateway.empty_image();
+    let at = Now::from_millis(1);
+    let frame = "182#0000C03F19000000".parse().unwrap();
+    for event in [BusEvent::Link { link: Link::ErrorActive, at }, BusEvent::Frame { frame, at }] {
+        gateway.handle_input(at, Input::Bus { bus: BusIndex(0), event });
+    }
+    while gateway.poll_output().is_some() {}
+    gateway.publish(&mut image);
+    let pressure = table.find_tag(table.find_node("node002").unwrap(), "pressure").unwrap();
+    assert_eq!(image.tag(pressure).quality, Quality::NEVER);
+    assert_eq!(image.nodes[1].counters.frames_received, 1, "it was seen all the same");
 }

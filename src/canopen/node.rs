@@ -474,9 +474,9 @@ impl Node {
                     self.polls.begin(now);
                 }
                 if let Some(start) = self.start.as_mut().filter(|_| done) {
-                    // A node that runs already will say so: it is not started for nothing.
+                    // A node that runs already will say so within the time of a heartbeat, and is not started for nothing.
                     let wait = match &self.watch {
-                        Watch::Heartbeat(heartbeat) if self.state.is_none() => heartbeat.timeout(),
+                        Watch::Heartbeat(heartbeat) if self.state.is_none() => heartbeat.timeout() * 2 / 3,
                         Watch::Heartbeat(_) | Watch::Guarding(_) | Watch::Nothing => Duration::ZERO,
                     };
                     start.handle_boot_done(now, self.state == Some(NmtState::Operational), wait);

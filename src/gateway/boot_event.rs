@@ -53,7 +53,7 @@ impl Gateway {
         let differs = wanted.is_some_and(|wanted| *wanted != mapped.maps);
         let watch = self.nodes.get_mut(index.0).and_then(|node| node.watches.get_mut(mapped.pdo.0));
         if let Some(watch) = watch {
-            watch.differs = differs;
+            watch.withheld = differs;
         }
         if differs {
             self.degrade(now, index, Some(mapped.pdo), Quality::Bad(Reason::MappingDiffers));

@@ -3,6 +3,7 @@
 //! What each event of its network does to it is in `node_event`.
 
 use super::Gateway;
+use crate::canopen::boot::BootStep;
 use crate::canopen::{ErrorControl, NmtState, PdoIndex};
 use crate::mapping::{AlarmOwner, BuiltIn, NodeDef};
 use crate::process_image::{NodeIndex, NodeStatus, PdoStatus, Quality, Reason};
@@ -54,8 +55,8 @@ pub(super) struct PdoWatch {
     pub(super) fresh_until: Option<Instant>,
     /// Its alarm is not raised before: when it did not come, the cause could still have been another.
     pub(super) held_until: Option<Instant>,
-    /// The device maps it otherwise than the mapping file: what it carries is not known.
-    pub(super) differs: bool,
+    /// What it carries is not known: the device was not asked yet, or maps it otherwise than the mapping file (R-DST-034).
+    pub(super) withheld: bool,
     /// Set reserved bits of the last frame.
     pub(super) reserved: u64,
     /// That it is too long has been told.
@@ -88,6 +89,10 @@ impl Node {
             pdos: pdos.iter().map(|pdo| PdoStatus { number: pdo.number, ..PdoStatus::default() }).collect(),
             ..NodeStatus::default()
         };
+        let asked = |place: usize| {
+            let is_of = |step: &BootStep| matches!(step, BootStep::Pdo(setup) if setup.pdo.0 == place);
+            !passive && def.canopen.boot.steps.iter().any(is_of)
+        };
         Self {
             status,
             nmt: None,
@@ -108,7 +113,9 @@ impl Node {
             missing_since: None,
             recovered_at: None,
             fell_silent: false,
-            watches: vec![PdoWatch::default(); pdos.len()],
+            watches: (0..pdos.len())
+                .map(|pdo| PdoWatch { withheld: asked(pdo), ..PdoWatch::default() })
+                .collect(),
         }
     }
 

@@ -114,7 +114,7 @@ impl Gateway {
         else {
             return;
         };
-        if watch.differs {
+        if watch.withheld {
             return;
         }
         status.last_received = Some(now.instant);

@@ -11,7 +11,7 @@ use crate::canopen::sdo::SdoSettings;
 use crate::canopen::{
     ErrorControl, Network, NetworkOutput, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex, PdoSettings,
 };
-use crate::time::{Instant, Now};
+use crate::time::Now;
 
 const fn object(index: u16, sub: u8) -> ObjectId {
     ObjectId::new(index, sub)
@@ -169,16 +169,22 @@ impl Plant {
         self.drain();
     }
 
+    /// Runs timers; the device sends its heartbeat once that is switched on.
     fn run(&mut self, millis: u64) -> &mut Self {
         let end = self.now + millis;
-        while let Some((at, _)) =
-            self.network.poll_timeout().filter(|(at, _)| *at <= Instant::from_millis(end))
-        {
-            self.now = self.now.max(at.as_micros().div_ceil(1000));
-            self.network.handle_timeout(Now::from_millis(self.now));
-            self.drain();
+        while self.now < end {
+            self.now += 1;
+            let now = Now::from_millis(self.now);
+            if self.network.poll_timeout().is_some_and(|(at, _)| at <= now.instant) {
+                self.network.handle_timeout(now);
+                self.drain();
+            }
+            let period = self.device.objects.get(&object(0x1017, 0)).filter(|_| !self.device.mute);
+            let period = period.map_or(0, |data| u64::from(u16::from_le_bytes([data[0], data[1]])));
+            if period > 0 && self.now.is_multiple_of(period) {
+                self.frame(&format!("701#{:02X}", self.device.state.code()));
+            }
         }
-        self.now = end;
         self
     }
 
