@@ -69,9 +69,9 @@ fn an_interface_that_goes_down_is_one_alarm_and_comes_back_by_itself() {
         .filter(|message| message.topic.contains("/alarm/") && message.payload["active"] == true)
         .map(|message| message.topic)
         .collect();
-    let expected = format!("{TOPICS}bridge/alarm/can0_interface_down");
+    let expected = "bridge/alarm/can0_interface_down";
     assert!(
-        !raised.is_empty() && raised.iter().all(|topic| *topic == expected),
+        !raised.is_empty() && raised.iter().all(|topic| topic == expected),
         "one cause, one alarm: {raised:?}"
     );
 

@@ -1,13 +1,11 @@
 //! A device that falls silent, comes back, or answers wrongly (V-DET-02, 03, 14, 15).
 
-use std::time::Duration;
-
 use crate::harness::broker::{Broker, Subscriber};
 use crate::harness::bus::{Capture, cansend, take_the_bus};
 use crate::harness::device::Device;
 use crate::harness::gateway::{Gateway, Setup, TOPICS};
 use crate::harness::modbus::{Table, mbpoll};
-use crate::harness::wait::{give_it, wait_until};
+use crate::harness::wait::wait_until;
 
 /// Input registers of the node block.
 const NMT_STATE: u16 = 2;
