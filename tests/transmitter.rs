@@ -6,7 +6,7 @@ use std::sync::Arc;
 use cangate::can::{BusEvent, BusIndex, Link};
 use cangate::canopen::{NmtState, NodeId};
 use cangate::gateway::{Gateway, Input};
-use cangate::mapping::{Sketch, TagTable};
+use cangate::mapping::{Sketch, SourceText, TagTable, check_mapping};
 use cangate::process_image::{Quality, Reason};
 use cangate::simulator::{DevicePlan, Kind, Scenario};
 use cangate::time::Now;
@@ -136,4 +136,40 @@ fn r_dst_034_nothing_is_shown_before_it_is_known_what_the_tpdo_carries() {
     let pressure = table.find_tag(table.find_node("node002").unwrap(), "pressure").unwrap();
     assert_eq!(image.tag(pressure).quality, Quality::NEVER);
     assert_eq!(image.nodes[1].counters.frames_received, 1, "it was seen all the same");
+}
+
+#[test]
+fn mistakes_about_objects_are_told_with_the_way_out() {
+    let shipped = cangate::mapping::shipped("danfoss-dst-p92c").unwrap();
+    for (right, wrong, message) in [
+        ("\"0x6130:1/32\"", "\"0x6130:1/16\"", "0x6130:1 is mapped with 16 bits, but `f32` has 32"),
+        ("\"0x6130:1/32\"", "\"0x6130-1\"", "`0x6130-1` is no mapped object"),
+        ("maps = [\"0x6130:1/32\", \"0x9130:2/32\"]\n", "", "the length of TPDO 1 is not known"),
+        ("poll_ms = 60000", "poll_ms = 50", "poll_ms 50 is out of range"),
+        (
+            "object = \"0x3000:0\"\n",
+            "object = \"0x3000:0\"\ntpdo = 1\n",
+            "needs either `tpdo` and `bit`, or `object`",
+        ),
+        (
+            "poll_ms = 60000\n",
+            "",
+            "no TPDO maps 0x3000:0, so `pressure_overflow_count` would never have a value",
+        ),
+        ("value = 0x004E0000", "value = -1", "dst.toml:45"),
+        (
+            "event_timer_ms = 1000",
+            "event_timer_ms = 1000\ninhibit_time_us = 50",
+            "inhibit_time_us 50 cannot be set",
+        ),
+    ] {
+        let text = shipped.replacen(right, wrong, 1);
+        assert_ne!(text, shipped, "{right}");
+        let problems = check_mapping(&SourceText::new("dst.toml", text.as_str())).unwrap_err();
+        let told: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        assert!(
+            told.iter().any(|line| line.contains(message) && line.contains("hint: ")),
+            "{wrong}: {told:#?}"
+        );
+    }
 }

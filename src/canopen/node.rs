@@ -12,7 +12,7 @@ use super::heartbeat::Heartbeat;
 use super::outputs::Outputs;
 use super::pdo::Pdos;
 use super::polls::Polls;
-use super::sdo::{Refused, SdoClient, SdoOutput, SdoRequest, TransferId};
+use super::sdo::{Refused, SdoClient, SdoError, SdoOutput, SdoRequest, TransferId};
 use super::start::Start;
 use super::{ErrorControl, NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex, Role, cob_id};
 use crate::can::{CanFrame, CanId};
@@ -433,15 +433,16 @@ impl Node {
         }
     }
 
-    /// Reads the next object that is due. A stopped node answers no SDO (R-DST-071): that turn is left out.
+    /// Reads the next object that is due. A stopped node answers no SDO (R-DST-071): that reading has failed.
     fn poll(&mut self, now: Instant, outputs: &mut Outputs) {
         let Some((id, request)) = self.polls.handle_timeout(now) else { return };
         let taken = self.state != Some(NmtState::Stopped)
             && self.sdo.as_mut().is_some_and(|sdo| sdo.request(now, id, request).is_ok());
         if taken {
             self.transfer(now, outputs);
-        } else {
-            self.polls.handle_sdo(id);
+        } else if let Some(poll) = self.polls.handle_sdo(id) {
+            let result = Err(SdoError::BusUnavailable);
+            outputs.node(self.id, NodeEvent::Polled { poll, result });
         }
     }
 

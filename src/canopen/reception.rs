@@ -81,6 +81,7 @@ impl Node {
             if let Some(start) = &mut self.start {
                 start.handle_boot_begun();
             }
+            self.transfer(now, outputs);
         }
         self.invalid = None;
         self.set_state(NmtState::Initialising, true, outputs);
@@ -113,6 +114,7 @@ impl Node {
             outputs.node(self.id, NodeEvent::Recovered);
             // It may be another device, or one that lost its settings: everything is read again.
             self.boot.handle_recovered(now);
+            self.transfer(now, outputs);
         }
         if !matches!(self.watch, Watch::Nothing) && !std::mem::replace(&mut self.supervised, true) {
             outputs.node(self.id, NodeEvent::Supervised);

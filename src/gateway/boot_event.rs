@@ -3,7 +3,8 @@
 use super::Gateway;
 use super::node::BootTrouble;
 use super::tags::CarrierIndex;
-use crate::canopen::boot::{BootEvent, BootFailure, BootStep, MappedPdo};
+use crate::canopen::PdoIndex;
+use crate::canopen::boot::{BootEvent, BootFailure, MappedPdo};
 use crate::canopen::sdo::SdoError;
 use crate::process_image::{NodeIndex, Quality, Reason};
 use crate::time::Now;
@@ -23,6 +24,7 @@ impl Gateway {
                     event.text = format!("TPDO{number} is otherwise in the device than in its mapping file");
                 });
             }
+            BootEvent::Begun => self.withhold(at.1),
             BootEvent::Mapped(mapped) => self.mapped(at, mapped),
             BootEvent::Done { written } => {
                 self.change(at.1, |node| {
@@ -37,20 +39,21 @@ impl Gateway {
         }
     }
 
+    /// The device is asked anew what its TPDOs carry: until it has said so, nothing in them is believed (R-DST-034).
+    fn withhold(&mut self, index: NodeIndex) {
+        let (Some(def), Some(node)) = (self.table.nodes.get(index.0), self.nodes.get_mut(index.0)) else {
+            return;
+        };
+        for (place, watch) in node.watches.iter_mut().enumerate() {
+            watch.withheld = def.canopen.boot.asks_about(PdoIndex(place));
+        }
+    }
+
     /// A TPDO that the device maps otherwise than the mapping file carries nobody knows what: its tags are withheld.
     fn mapped(&mut self, at: (Now, NodeIndex), mapped: &MappedPdo) {
         let (now, index) = at;
-        let wanted = self.table.nodes.get(index.0).and_then(|def| {
-            def.canopen.boot.steps.iter().find_map(|step| match step {
-                BootStep::Pdo(setup) if setup.pdo == mapped.pdo => Some(&setup.maps),
-                BootStep::Pdo(_)
-                | BootStep::Identity { .. }
-                | BootStep::Read { .. }
-                | BootStep::Write { .. }
-                | BootStep::Save => None,
-            })
-        });
-        let differs = wanted.is_some_and(|wanted| *wanted != mapped.maps);
+        let wanted = self.table.nodes.get(index.0).and_then(|def| def.canopen.boot.setup_of(mapped.pdo));
+        let differs = wanted.is_some_and(|wanted| wanted.maps != mapped.maps);
         let watch = self.nodes.get_mut(index.0).and_then(|node| node.watches.get_mut(mapped.pdo.0));
         if let Some(watch) = watch {
             watch.withheld = differs;
@@ -78,7 +81,9 @@ impl Gateway {
             return;
         };
         let carrier = CarrierIndex(def.canopen.pdos.len() + poll);
-        if let Ok(data) = result {
+        // Of fewer bytes than its type has, no value can be made.
+        let length = def.canopen.polls.get(poll).map_or(0, |poll| poll.length);
+        if let Some(data) = result.as_ref().ok().filter(|data| data.len() >= length) {
             let quality = node.quality_of_new_data(false);
             self.tags.apply(&self.table, now, (index, carrier), data, quality);
         } else {

@@ -3,7 +3,6 @@
 //! What each event of its network does to it is in `node_event`.
 
 use super::Gateway;
-use crate::canopen::boot::BootStep;
 use crate::canopen::{ErrorControl, NmtState, PdoIndex};
 use crate::mapping::{AlarmOwner, BuiltIn, NodeDef};
 use crate::process_image::{NodeIndex, NodeStatus, PdoStatus, Quality, Reason};
@@ -89,10 +88,7 @@ impl Node {
             pdos: pdos.iter().map(|pdo| PdoStatus { number: pdo.number, ..PdoStatus::default() }).collect(),
             ..NodeStatus::default()
         };
-        let asked = |place: usize| {
-            let is_of = |step: &BootStep| matches!(step, BootStep::Pdo(setup) if setup.pdo.0 == place);
-            !passive && def.canopen.boot.steps.iter().any(is_of)
-        };
+        let asked = |place: usize| !passive && def.canopen.boot.asks_about(PdoIndex(place));
         Self {
             status,
             nmt: None,

@@ -293,8 +293,12 @@ impl<'a> NodeView<'a> {
         self.status.nmt == Some(NmtState::Operational)
     }
 
+    /// All that comes from the device itself, in TPDOs or by reading.
     fn all_data_good(&self) -> bool {
-        self.pdo_tags().all(|(_, quality)| quality.is_good())
+        let tags = self.table.tags.get(self.def.tags.clone()).unwrap_or_default();
+        tags.iter().zip(self.def.tags.clone()).all(|(tag, index)| {
+            matches!(tag.source, Source::Derived(_)) || self.image.tag(TagIndex(index)).quality.is_good()
+        })
     }
 
     /// The TPDO place and quality of each tag that comes from a TPDO.

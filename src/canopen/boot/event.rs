@@ -8,6 +8,8 @@ use crate::canopen::sdo::SdoError;
 /// Something that the boot of a node found or did.
 #[derive(Clone, Debug, PartialEq)]
 pub enum BootEvent {
+    /// It begins, or begins anew: what was known of the node's configuration is not known any more.
+    Begun,
     /// An object was read; `None` where the node refuses to tell it.
     Object {
         /// Which.

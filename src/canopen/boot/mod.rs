@@ -218,6 +218,7 @@ impl Boot {
         if !self.is_empty() {
             self.phase = Phase::Waiting(at);
             self.task = None;
+            self.outputs.push_back(BootOutput::Tell(BootEvent::Begun));
         }
     }
 

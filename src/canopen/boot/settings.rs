@@ -16,6 +16,27 @@ pub struct BootSettings {
     pub longest_retry: Duration,
 }
 
+impl BootSettings {
+    /// What is done with a TPDO, if anything.
+    #[must_use]
+    pub fn setup_of(&self, pdo: PdoIndex) -> Option<&PdoSetup> {
+        self.steps.iter().find_map(|step| match step {
+            BootStep::Pdo(setup) if setup.pdo == pdo => Some(setup),
+            BootStep::Pdo(_)
+            | BootStep::Identity { .. }
+            | BootStep::Read { .. }
+            | BootStep::Write { .. }
+            | BootStep::Save => None,
+        })
+    }
+
+    /// Whether the node is asked what a TPDO carries.
+    #[must_use]
+    pub fn asks_about(&self, pdo: PdoIndex) -> bool {
+        self.setup_of(pdo).is_some()
+    }
+}
+
 impl Default for BootSettings {
     fn default() -> Self {
         Self { steps: Vec::new(), retry: Duration::from_secs(1), longest_retry: Duration::from_secs(30) }

@@ -7,9 +7,11 @@ use super::bench::{detcon, master};
 use crate::can::{CanFrame, CanId};
 use crate::canopen::boot::{BootEvent, BootFailure, BootSettings, BootStep, MappingMode, PdoSetup};
 use crate::canopen::object::{MappedObject, ObjectId};
+use crate::canopen::polls::Poll;
 use crate::canopen::sdo::SdoSettings;
 use crate::canopen::{
-    ErrorControl, Network, NetworkOutput, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex, PdoSettings,
+    ErrorControl, Network, NetworkOutput, NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex,
+    PdoSettings,
 };
 use crate::time::Now;
 
@@ -95,6 +97,9 @@ struct Plant {
     device: Device,
     now: u64,
     told: Vec<BootEvent>,
+    begun: u32,
+    /// Of each reading of the polled object whether it succeeded.
+    polled: Vec<bool>,
     nmt: Vec<String>,
 }
 
@@ -129,6 +134,7 @@ impl Plant {
             error_control: ErrorControl::Heartbeat { timeout: Duration::from_millis(1500) },
             sdo: Some(SdoSettings::default()),
             boot: BootSettings { steps, ..BootSettings::default() },
+            polls: vec![Poll { object: object(0x6131, 1), period: Duration::from_secs(1), length: 4 }],
             pdos: vec![PdoSettings {
                 number: 1,
                 cob_id: CanId::Standard(0x181),
@@ -140,7 +146,15 @@ impl Plant {
             ..detcon(1)
         };
         let network = Network::new(master(vec![node]), Now::from_millis(0));
-        Self { network, device: Device::new(), now: 0, told: Vec::new(), nmt: Vec::new() }
+        Self {
+            network,
+            device: Device::new(),
+            now: 0,
+            told: Vec::new(),
+            begun: 0,
+            polled: Vec::new(),
+            nmt: Vec::new(),
+        }
     }
 
     fn drain(&mut self) {
@@ -158,7 +172,9 @@ impl Plant {
                         self.network.handle_frame(Now::from_millis(self.now), &answer);
                     }
                 }
+                NetworkOutput::Node(_, NodeEvent::Boot(BootEvent::Begun)) => self.begun += 1,
                 NetworkOutput::Node(_, NodeEvent::Boot(event)) => self.told.push(event),
+                NetworkOutput::Node(_, NodeEvent::Polled { result, .. }) => self.polled.push(result.is_ok()),
                 NetworkOutput::Node(..) | NetworkOutput::Foreign(_) => {}
             }
         }
@@ -345,4 +361,28 @@ fn r_dst_071_a_stopped_node_is_made_pre_operational_before_it_is_asked() {
     plant.run(3000);
     assert_eq!(plant.nmt.first().map(String::as_str), Some("000#8001"));
     assert_eq!(plant.nmt.last().map(String::as_str), Some("000#0101"));
+}
+
+#[test]
+fn r_dst_034_what_was_known_is_forgotten_at_every_boot_up_and_when_the_bus_was_away() {
+    let mut plant = Plant::new(steps());
+    plant.link_up();
+    assert_eq!(plant.begun, 1);
+    plant.network.handle_link(Now::from_millis(plant.now), false);
+    plant.link_up();
+    assert_eq!(plant.begun, 2);
+    plant.frame("701#00");
+    assert_eq!(plant.begun, 3, "at once, not when it is asked");
+}
+
+#[test]
+fn r_dst_071_088_a_stopped_node_is_not_read_and_its_polled_values_are_not_kept_alive() {
+    let mut plant = Plant::new(steps());
+    plant.link_up().run(2000);
+    assert!(plant.polled.len() >= 3 && plant.polled.iter().all(|good| *good), "{:?}", plant.polled);
+    plant.network.request_nmt(Now::from_millis(plant.now), NodeId::new(1), NmtRequest::Stop);
+    plant.drain();
+    plant.polled.clear();
+    plant.run(3000);
+    assert!(plant.polled.len() >= 2 && plant.polled.iter().all(|good| !*good), "{:?}", plant.polled);
 }

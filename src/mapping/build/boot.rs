@@ -16,7 +16,8 @@ use crate::canopen::polls::Poll;
 /// Producer heartbeat time.
 const HEARTBEAT: ObjectId = ObjectId::new(0x1017, 0);
 
-/// The steps of the boot, in the order of CiA 302-2: identity, error control, PDOs, configuration.
+/// The steps of the boot: identity, heartbeat, settings, and the PDOs last, so that what they carry is read when all else
+/// is as it should be.
 pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
     let mut steps = identity(problems, context);
     if let Some(at) = &context.file.error_control.heartbeat_ms {
@@ -40,6 +41,10 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
         let transmission_type = number(&section.transmission_type, "transmission_type", 255);
         let event_timer = number(&section.event_timer_ms, "event_timer_ms", 65_535);
         let inhibit_time = number(&section.inhibit_time_us, "inhibit_time_us", 6_553_500);
+        if let Some(at) = section.inhibit_time_us.as_ref().filter(|at| !at.value.is_multiple_of(100)) {
+            let message = format!("inhibit_time_us {} cannot be set", at.value);
+            problems.error(context.source, &at.span, message, "devices count in steps of 100 us");
+        }
         steps.push(BootStep::Pdo(PdoSetup {
             pdo: PdoIndex(place),
             number: u16::try_from(tpdo.number).unwrap_or_default(),

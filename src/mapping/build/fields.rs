@@ -10,6 +10,7 @@ use super::items::{Entry, Item};
 use super::node::{self, Tpdo};
 use super::problems::Problems;
 use super::tags::{Context, Kind};
+use crate::canopen::object::ObjectId;
 
 /// The place of a TPDO that there is not; never in a finished table.
 const NO_TPDO: usize = usize::MAX;
@@ -115,6 +116,11 @@ fn place(
         (Some(tpdo), Some(bit), None) => Some((tpdo.clone(), bit.clone())),
         (None, None, Some(object)) => {
             let id = node::object(problems, source, object)?;
+            if let Some(array) = &section.array {
+                let message = "an array cannot be one object".to_owned();
+                problems.error(source, &array.span, message, "write an entry for each object");
+            }
+            check_width(problems, context, section, object, id);
             let found =
                 context.tpdos.iter().find_map(|tpdo| Some((tpdo.number, node::bit_of(tpdo.section, id)?)));
             if found.is_none() && section.poll_ms.is_none() {
@@ -134,6 +140,24 @@ fn place(
             problems.error(source, &item.span, message, "write where it stands, or which object it is");
             None
         }
+    }
+}
+
+/// A TPDO that carries fewer bits of an object than its type has would leave the rest to its neighbour.
+fn check_width(
+    problems: &mut Problems,
+    context: &Context<'_>,
+    section: &TagSection,
+    object: &At<String>,
+    id: ObjectId,
+) {
+    let entries = context.tpdos.iter().flat_map(|tpdo| &tpdo.section.maps);
+    let bits = entries.filter_map(|entry| node::mapped(&entry.value)).find(|entry| entry.object == id);
+    if let Some((bits, (_, width))) = bits.map(|entry| entry.bits).zip(parse(&section.kind.value))
+        && width > bits
+    {
+        let message = format!("{id} is mapped with {bits} bits, but `{}` has {width}", section.kind.value);
+        problems.error(context.source, &object.span, message, "let `type` and `maps` agree");
     }
 }
 

@@ -1,34 +1,10 @@
 //! What an EDS or DCF says of a device.
 
 use std::collections::BTreeMap;
-use std::fmt;
 
 use super::number::{self, Whole};
 use super::report::Place;
-
-/// An entry of the object dictionary.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct ObjectId {
-    /// Index.
-    pub index: u16,
-    /// Sub-index; 0 for an object that has none.
-    pub sub: u8,
-}
-
-impl ObjectId {
-    /// An entry of the object dictionary.
-    #[must_use]
-    pub const fn new(index: u16, sub: u8) -> Self {
-        Self { index, sub }
-    }
-}
-
-/// `0x6401:1`, the sub-index decimal.
-impl fmt::Display for ObjectId {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "0x{:04X}:{}", self.index, self.sub)
-    }
-}
+pub use crate::canopen::object::ObjectId;
 
 /// A device as its EDS or DCF describes it.
 #[derive(Clone, Debug, Default)]
