@@ -18,7 +18,7 @@
 //! - [`boot`]: what is done with a node before it is started.
 //! - [`polls`]: objects that are read again and again.
 //! - `guarding`, `heartbeat`, `start`, `pdo`, `duplicate`: one machine each, for one node.
-//! - `node`: one node, made of those machines; `reception`: what its frames mean for it.
+//! - `node`: one node, made of those machines.
 //! - `network`: all nodes of a bus; dispatches frames.
 
 pub mod boot;
@@ -37,7 +37,6 @@ mod outputs;
 mod pdo;
 pub mod polls;
 pub mod probe;
-mod reception;
 pub mod sdo;
 pub mod settings;
 mod start;

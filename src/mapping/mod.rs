@@ -3,8 +3,8 @@
 //! Reads text, opens no file. From the mapping files and the installation's buses and nodes it makes one checked,
 //! resolved, immutable [`TagTable`], or a list of [`Diagnostic`]s, all at once, each with file, line, column and hint.
 //!
-//! - [`file`](mod@file), [`file_values`]: the TOML form of a mapping, as `mappings/README.md` teaches it. [`shipped`](mod@shipped): those
-//!   that come with the program.
+//! - [`file`](mod@file): the TOML form of a mapping, as `mappings/README.md` teaches it. [`shipped`](mod@shipped): those that come
+//!   with the program.
 //! - [`installation`]: the `[bus.*]` and `[node.*]` tables of the configuration.
 //! - [`build`](mod@build): from both to the tag table, or to everything that is wrong.
 //! - [`builtin`]: the alarms that every gateway, bus and node has.
@@ -25,7 +25,6 @@ pub mod eds;
 pub mod expression;
 pub mod expression_parser;
 pub mod file;
-pub mod file_values;
 pub mod fingerprint;
 pub mod installation;
 pub mod objection;

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::super::expression_parser::parse;
 use super::super::file::DerivedSection;
-use super::super::file_values::NameList;
+use super::super::file::values::NameList;
 use super::super::table::Derived;
 use super::super::{At, Expression, SourceText};
 use super::items::{Element, Found, Item};

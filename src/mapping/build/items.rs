@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
+use super::super::file::values::NameList;
 use super::super::file::{ArraySection, DerivedSection, MappingFile, ParameterSection, TagSection};
-use super::super::file_values::NameList;
 use super::super::{At, SourceText};
 use super::problems::{Problems, is_snake_case, matched};
 

@@ -1,22 +1,27 @@
 //! One node: the machines of its life, its start and its TPDOs, and the state it is believed to be in.
 //!
-//! This file joins the machines and runs their clocks; what a received frame means is in `reception`.
+//! This file joins the machines and runs their clocks.
+//!
+//! - `watch`: how its life is watched. `reception`: what its frames mean. `transfers`: what it is asked by SDO.
+
+mod reception;
+mod transfers;
+mod watch;
 
 use std::time::Duration;
 
-use super::boot::BootSettings;
-use super::boot::{Boot, BootEvent, BootOutput};
+use super::boot::{Boot, BootSettings};
 use super::duplicate::Duplicate;
-use super::guarding::{Failure, Guarding};
-use super::heartbeat::Heartbeat;
+use super::guarding::Failure;
 use super::outputs::Outputs;
 use super::pdo::Pdos;
 use super::polls::Polls;
-use super::sdo::{Refused, SdoClient, SdoError, SdoOutput, SdoRequest, TransferId};
+use super::sdo::{Refused, SdoClient};
 use super::start::Start;
-use super::{ErrorControl, NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex, Role, cob_id};
+use super::{NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex, Role, cob_id};
 use crate::can::{CanFrame, CanId};
 use crate::time::Instant;
+use watch::Watch;
 
 /// A boot-up message this long after an ordered reset was ordered too; slow devices take seconds.
 const RESET_TAKES: Duration = Duration::from_secs(30);
@@ -70,57 +75,6 @@ pub enum SdoRefused {
     /// The client does not take it.
     #[error(transparent)]
     Client(#[from] Refused),
-}
-
-/// How the life of the node is watched.
-#[derive(Debug)]
-pub(super) enum Watch {
-    /// By asking.
-    Guarding(Guarding),
-    /// By listening.
-    Heartbeat(Heartbeat),
-    /// Not at all.
-    Nothing,
-}
-
-impl Watch {
-    /// `phase`: wait before the first guard request.
-    fn new(control: ErrorControl, role: Role, phase: Duration, now: Instant) -> Self {
-        match (control, role) {
-            (ErrorControl::Guarding(settings), _) if settings.guard_time.is_zero() => Self::Nothing,
-            (ErrorControl::Guarding(settings), Role::Master) => {
-                Self::Guarding(Guarding::new(settings, phase, now))
-            }
-            (ErrorControl::Guarding(settings), Role::Passive) => {
-                let life_time = settings.guard_time.saturating_mul(settings.life_time_factor.max(1).into());
-                Self::Heartbeat(Heartbeat::after_first_frame(life_time + settings.reply_timeout))
-            }
-            (ErrorControl::Heartbeat { timeout }, Role::Master) => {
-                Self::Heartbeat(Heartbeat::new(timeout, now))
-            }
-            (ErrorControl::Heartbeat { timeout }, Role::Passive) => {
-                Self::Heartbeat(Heartbeat::after_first_frame(timeout))
-            }
-            (ErrorControl::None, _) => Self::Nothing,
-        }
-    }
-
-    /// Whether the node is lost.
-    pub(super) fn is_lost(&self) -> bool {
-        match self {
-            Self::Guarding(guarding) => guarding.is_lost(),
-            Self::Heartbeat(heartbeat) => heartbeat.is_lost(),
-            Self::Nothing => false,
-        }
-    }
-
-    /// The guard machine, where there is one.
-    pub(super) fn guarding(&mut self) -> Option<&mut Guarding> {
-        match self {
-            Self::Guarding(guarding) => Some(guarding),
-            Self::Heartbeat(_) | Self::Nothing => None,
-        }
-    }
 }
 
 impl Node {
@@ -381,117 +335,6 @@ impl Node {
         .into_iter()
         .flatten()
         .min_by_key(|(at, _)| *at)
-    }
-
-    /// Asks for a transfer.
-    pub(super) fn request_sdo(
-        &mut self,
-        now: Instant,
-        id: TransferId,
-        request: SdoRequest,
-        outputs: &mut Outputs,
-    ) -> Result<(), SdoRefused> {
-        if self.state == Some(NmtState::Stopped) {
-            return Err(SdoRefused::Stopped);
-        }
-        self.sdo.as_mut().ok_or(SdoRefused::NoSdo)?.request(now, id, request)?;
-        self.transfer(now, outputs);
-        Ok(())
-    }
-
-    /// An SDO request of ours did not leave.
-    pub(super) fn sdo_not_sent(&mut self, frame: &CanFrame) {
-        if let Some(sdo) = &mut self.sdo {
-            sdo.handle_not_sent(frame);
-        }
-    }
-
-    /// TPDOs that have another identifier than before; `None`: they are switched off.
-    pub(super) fn take_moved(&mut self) -> Vec<(PdoIndex, Option<CanId>)> {
-        std::mem::take(&mut self.moved)
-    }
-
-    /// Carries requests from the boot to the SDO client, and results back, until both have nothing more to say.
-    pub(super) fn transfer(&mut self, now: Instant, outputs: &mut Outputs) {
-        loop {
-            if let Some(output) = self.boot.poll_output() {
-                self.boot_output(now, output, outputs);
-            } else if let Some(output) = self.sdo.as_mut().and_then(SdoClient::poll_output) {
-                match output {
-                    SdoOutput::Transmit(frame) => outputs.transmit(frame),
-                    SdoOutput::Done(id, result) if Boot::is_mine(id) => self.boot.handle_sdo(now, id, result),
-                    SdoOutput::Done(id, result) if Polls::is_mine(id) => {
-                        if let Some(poll) = self.polls.handle_sdo(id) {
-                            outputs.node(self.id, NodeEvent::Polled { poll, result });
-                        }
-                    }
-                    SdoOutput::Done(id, result) => outputs.node(self.id, NodeEvent::Sdo { id, result }),
-                }
-            } else {
-                return;
-            }
-        }
-    }
-
-    /// Reads the next object that is due. A stopped node answers no SDO (R-DST-071): that reading has failed.
-    fn poll(&mut self, now: Instant, outputs: &mut Outputs) {
-        let Some((id, request)) = self.polls.handle_timeout(now) else { return };
-        let taken = self.state != Some(NmtState::Stopped)
-            && self.sdo.as_mut().is_some_and(|sdo| sdo.request(now, id, request).is_ok());
-        if taken {
-            self.transfer(now, outputs);
-        } else if let Some(poll) = self.polls.handle_sdo(id) {
-            let result = Err(SdoError::BusUnavailable);
-            outputs.node(self.id, NodeEvent::Polled { poll, result });
-        }
-    }
-
-    fn boot_output(&mut self, now: Instant, output: BootOutput, outputs: &mut Outputs) {
-        match output {
-            BootOutput::Sdo(id, request) => {
-                // In Stopped a node takes no SDO requests (R-DST-071). Who stopped it wants it to stay so.
-                let stopped = self.state == Some(NmtState::Stopped);
-                let held = self.start.as_ref().is_some_and(Start::is_held);
-                if stopped && held {
-                    return self.boot.postpone(now);
-                }
-                if stopped {
-                    self.enter_pre_operational(now, outputs);
-                }
-                let taken = self.sdo.as_mut().is_some_and(|sdo| sdo.request(now, id, request).is_ok());
-                if !taken {
-                    self.boot.handle_refused(now);
-                }
-            }
-            BootOutput::EnterPreOperational => self.enter_pre_operational(now, outputs),
-            BootOutput::Tell(event) => {
-                if let BootEvent::Mapped(mapped) = &event {
-                    self.pdos.set_length(mapped.pdo, mapped.length());
-                    self.moved.push((mapped.pdo, mapped.cob_id));
-                }
-                let done = matches!(event, BootEvent::Done { .. });
-                outputs.node(self.id, NodeEvent::Boot(event));
-                if done {
-                    self.polls.begin(now);
-                }
-                if let Some(start) = self.start.as_mut().filter(|_| done) {
-                    // A node that runs already will say so within the time of a heartbeat, and is not started for nothing.
-                    let wait = match &self.watch {
-                        Watch::Heartbeat(heartbeat) if self.state.is_none() => heartbeat.timeout() * 2 / 3,
-                        Watch::Heartbeat(_) | Watch::Guarding(_) | Watch::Nothing => Duration::ZERO,
-                    };
-                    start.handle_boot_done(now, self.state == Some(NmtState::Operational), wait);
-                }
-            }
-        }
-    }
-
-    /// So that its configuration can be changed; it is started when that is done.
-    fn enter_pre_operational(&mut self, now: Instant, outputs: &mut Outputs) {
-        let request = NmtRequest::EnterPreOperational;
-        outputs.transmit(request.frame(Some(self.id)));
-        self.note_sent(now, request, outputs);
-        self.state = Some(NmtState::PreOperational);
     }
 
     /// A guard request was not answered.

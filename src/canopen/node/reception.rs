@@ -4,11 +4,13 @@
 
 use std::time::Duration;
 
-use super::guarding::Verdict;
-use super::node::{Node, Watch};
-use super::outputs::Outputs;
-use super::pdo::Length;
-use super::{NmtRequest, NmtState, NodeEvent, PdoIndex};
+use super::super::guarding::Verdict;
+use super::super::outputs::Outputs;
+use super::super::pdo::Length;
+use super::super::start::{STORM_WAIT, Start};
+use super::super::{NmtRequest, NmtState, NodeEvent, PdoIndex};
+use super::Node;
+use super::watch::Watch;
 use crate::can::{CanFrame, CanId};
 use crate::time::Instant;
 
@@ -17,7 +19,7 @@ const FOREIGN_GUARD_QUIET: Duration = Duration::from_secs(60);
 
 impl Node {
     /// A frame on `0x700 + id`.
-    pub(super) fn handle_error_control(
+    pub(in crate::canopen) fn handle_error_control(
         &mut self,
         now: Instant,
         frame: &CanFrame,
@@ -88,7 +90,7 @@ impl Node {
         self.ordered = None;
         self.pdos.stop();
         if self.start.as_mut().is_some_and(|start| start.handle_boot_up(now)) {
-            outputs.node(self.id, NodeEvent::StartHeldBack { wait: super::start::STORM_WAIT });
+            outputs.node(self.id, NodeEvent::StartHeldBack { wait: STORM_WAIT });
         }
         false
     }
@@ -120,7 +122,7 @@ impl Node {
             outputs.node(self.id, NodeEvent::Supervised);
         }
         let start = self.report(now, code, outputs);
-        let reset = recovered && self.start.as_ref().is_some_and(super::start::Start::resets_on_recovery);
+        let reset = recovered && self.start.as_ref().is_some_and(Start::resets_on_recovery);
         if reset {
             self.send_reset(now, outputs);
         }
@@ -205,7 +207,7 @@ impl Node {
     }
 
     fn operational(&mut self, now: Instant, outputs: &mut Outputs) {
-        if self.start.as_mut().is_some_and(super::start::Start::handle_operational) {
+        if self.start.as_mut().is_some_and(Start::handle_operational) {
             outputs.node(self.id, NodeEvent::StartSucceeded);
         }
         if !self.watch.is_lost() {
@@ -214,7 +216,7 @@ impl Node {
     }
 
     /// A frame on the identifier of a TPDO.
-    pub(super) fn handle_pdo(
+    pub(in crate::canopen) fn handle_pdo(
         &mut self,
         now: Instant,
         pdo: PdoIndex,
@@ -271,7 +273,12 @@ impl Node {
     }
 
     /// A frame on `0x080 + id` (R-DET-091). Devices from before version 4 of CiA 301 boot up with an empty one.
-    pub(super) fn handle_emergency(&mut self, now: Instant, frame: &CanFrame, outputs: &mut Outputs) -> bool {
+    pub(in crate::canopen) fn handle_emergency(
+        &mut self,
+        now: Instant,
+        frame: &CanFrame,
+        outputs: &mut Outputs,
+    ) -> bool {
         if frame.is_remote() {
             outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
             return false;
@@ -293,7 +300,12 @@ impl Node {
     }
 
     /// A frame on `0x580 + id`.
-    pub(super) fn handle_sdo_answer(&mut self, now: Instant, frame: &CanFrame, outputs: &mut Outputs) {
+    pub(in crate::canopen) fn handle_sdo_answer(
+        &mut self,
+        now: Instant,
+        frame: &CanFrame,
+        outputs: &mut Outputs,
+    ) {
         self.frame_seen(now, outputs);
         if let Some(sdo) = &mut self.sdo {
             sdo.handle_answer(now, frame);
@@ -302,14 +314,14 @@ impl Node {
     }
 
     /// A 29-bit frame with the number of one of the node's identifiers (R-DET-006).
-    pub(super) fn handle_foreign_format(&mut self, frame: &CanFrame, outputs: &mut Outputs) {
+    pub(in crate::canopen) fn handle_foreign_format(&mut self, frame: &CanFrame, outputs: &mut Outputs) {
         debug_assert!(matches!(frame.id(), CanId::Extended(_)), "11-bit frames are dispatched by kind");
         outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
     }
 
     /// Another master's command to this node was overheard. Its effect is believed in the passive role, which has no
     /// other way to learn of it; a master asks the node instead.
-    pub(super) fn handle_foreign_command(
+    pub(in crate::canopen) fn handle_foreign_command(
         &mut self,
         now: Instant,
         request: NmtRequest,

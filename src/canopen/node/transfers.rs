@@ -1,0 +1,127 @@
+//! What a node is asked by SDO: its boot, the objects that are polled, and what others want of it.
+
+use std::time::Duration;
+
+use super::super::boot::{Boot, BootEvent, BootOutput};
+use super::super::outputs::Outputs;
+use super::super::polls::Polls;
+use super::super::sdo::{SdoClient, SdoError, SdoOutput, SdoRequest, TransferId};
+use super::super::start::Start;
+use super::super::{NmtRequest, NmtState, NodeEvent, PdoIndex};
+use super::watch::Watch;
+use super::{Node, SdoRefused};
+use crate::can::{CanFrame, CanId};
+use crate::time::Instant;
+
+impl Node {
+    /// Asks for a transfer.
+    pub(in crate::canopen) fn request_sdo(
+        &mut self,
+        now: Instant,
+        id: TransferId,
+        request: SdoRequest,
+        outputs: &mut Outputs,
+    ) -> Result<(), SdoRefused> {
+        if self.state == Some(NmtState::Stopped) {
+            return Err(SdoRefused::Stopped);
+        }
+        self.sdo.as_mut().ok_or(SdoRefused::NoSdo)?.request(now, id, request)?;
+        self.transfer(now, outputs);
+        Ok(())
+    }
+
+    /// An SDO request of ours did not leave.
+    pub(in crate::canopen) fn sdo_not_sent(&mut self, frame: &CanFrame) {
+        if let Some(sdo) = &mut self.sdo {
+            sdo.handle_not_sent(frame);
+        }
+    }
+
+    /// TPDOs that have another identifier than before; `None`: they are switched off.
+    pub(in crate::canopen) fn take_moved(&mut self) -> Vec<(PdoIndex, Option<CanId>)> {
+        std::mem::take(&mut self.moved)
+    }
+
+    /// Carries requests from the boot to the SDO client, and results back, until both have nothing more to say.
+    pub(in crate::canopen) fn transfer(&mut self, now: Instant, outputs: &mut Outputs) {
+        loop {
+            if let Some(output) = self.boot.poll_output() {
+                self.boot_output(now, output, outputs);
+            } else if let Some(output) = self.sdo.as_mut().and_then(SdoClient::poll_output) {
+                match output {
+                    SdoOutput::Transmit(frame) => outputs.transmit(frame),
+                    SdoOutput::Done(id, result) if Boot::is_mine(id) => self.boot.handle_sdo(now, id, result),
+                    SdoOutput::Done(id, result) if Polls::is_mine(id) => {
+                        if let Some(poll) = self.polls.handle_sdo(id) {
+                            outputs.node(self.id, NodeEvent::Polled { poll, result });
+                        }
+                    }
+                    SdoOutput::Done(id, result) => outputs.node(self.id, NodeEvent::Sdo { id, result }),
+                }
+            } else {
+                return;
+            }
+        }
+    }
+
+    /// Reads the next object that is due. A stopped node answers no SDO (R-DST-071): that reading has failed.
+    pub(super) fn poll(&mut self, now: Instant, outputs: &mut Outputs) {
+        let Some((id, request)) = self.polls.handle_timeout(now) else { return };
+        let taken = self.state != Some(NmtState::Stopped)
+            && self.sdo.as_mut().is_some_and(|sdo| sdo.request(now, id, request).is_ok());
+        if taken {
+            self.transfer(now, outputs);
+        } else if let Some(poll) = self.polls.handle_sdo(id) {
+            let result = Err(SdoError::BusUnavailable);
+            outputs.node(self.id, NodeEvent::Polled { poll, result });
+        }
+    }
+
+    fn boot_output(&mut self, now: Instant, output: BootOutput, outputs: &mut Outputs) {
+        match output {
+            BootOutput::Sdo(id, request) => {
+                // In Stopped a node takes no SDO requests (R-DST-071). Who stopped it wants it to stay so.
+                let stopped = self.state == Some(NmtState::Stopped);
+                let held = self.start.as_ref().is_some_and(Start::is_held);
+                if stopped && held {
+                    return self.boot.postpone(now);
+                }
+                if stopped {
+                    self.enter_pre_operational(now, outputs);
+                }
+                let taken = self.sdo.as_mut().is_some_and(|sdo| sdo.request(now, id, request).is_ok());
+                if !taken {
+                    self.boot.handle_refused(now);
+                }
+            }
+            BootOutput::EnterPreOperational => self.enter_pre_operational(now, outputs),
+            BootOutput::Tell(event) => {
+                if let BootEvent::Mapped(mapped) = &event {
+                    self.pdos.set_length(mapped.pdo, mapped.length());
+                    self.moved.push((mapped.pdo, mapped.cob_id));
+                }
+                let done = matches!(event, BootEvent::Done { .. });
+                outputs.node(self.id, NodeEvent::Boot(event));
+                if done {
+                    self.polls.begin(now);
+                }
+                if let Some(start) = self.start.as_mut().filter(|_| done) {
+                    // A node that runs already will say so within the time of a heartbeat, and is not started for nothing.
+                    let wait = match &self.watch {
+                        Watch::Heartbeat(heartbeat) if self.state.is_none() => heartbeat.timeout() * 2 / 3,
+                        Watch::Heartbeat(_) | Watch::Guarding(_) | Watch::Nothing => Duration::ZERO,
+                    };
+                    start.handle_boot_done(now, self.state == Some(NmtState::Operational), wait);
+                }
+            }
+        }
+    }
+
+    /// So that its configuration can be changed; it is started when that is done.
+    fn enter_pre_operational(&mut self, now: Instant, outputs: &mut Outputs) {
+        let request = NmtRequest::EnterPreOperational;
+        outputs.transmit(request.frame(Some(self.id)));
+        self.note_sent(now, request, outputs);
+        self.state = Some(NmtState::PreOperational);
+    }
+}
