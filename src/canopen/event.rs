@@ -170,6 +170,20 @@ pub enum ForeignEvent {
         /// Its node id byte, 0 = all.
         node: u8,
     },
+    /// A SYNC that the gateway did not send.
+    Sync {
+        /// Whether the gateway sends SYNC on this bus too: then there are two producers, and every device answers both.
+        produced: bool,
+        /// Whether it is the first on this bus.
+        first: bool,
+    },
+    /// A TIME message that the gateway did not send.
+    Time {
+        /// Whether the gateway sends TIME on this bus too.
+        produced: bool,
+        /// Whether it is the first on this bus.
+        first: bool,
+    },
     /// A frame of an identifier that belongs to no configured node, or a malformed NMT command.
     UnknownId {
         /// The identifier.

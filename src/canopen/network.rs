@@ -41,6 +41,8 @@ pub struct Network {
 enum Slot {
     #[default]
     Unknown,
+    Sync,
+    Time,
     ErrorControl(usize),
     Emergency(usize),
     SdoAnswer(usize),
@@ -50,7 +52,7 @@ enum Slot {
 impl Slot {
     fn node(self) -> Option<usize> {
         match self {
-            Self::Unknown => None,
+            Self::Unknown | Self::Sync | Self::Time => None,
             Self::ErrorControl(node) | Self::Emergency(node) | Self::SdoAnswer(node) | Self::Pdo(node, _) => {
                 Some(node)
             }
@@ -116,6 +118,8 @@ impl Network {
             node.pause();
             network.nodes.push(node);
         }
+        network.claim(cob_id::SYNC, Slot::Sync);
+        network.claim(cob_id::TIME, Slot::Time);
         for (id, slot) in pdos {
             network.claim(id, slot);
         }
@@ -140,8 +144,8 @@ impl Network {
                 node.handle_sdo_answer(at, frame, outputs);
                 false
             }
-            (Slot::Unknown, _) | (_, None) => {
-                self.handle_stranger(at, frame);
+            (Slot::Unknown | Slot::Sync | Slot::Time, _) | (_, None) => {
+                self.handle_stranger(at, slot, frame);
                 return;
             }
         };
@@ -295,9 +299,18 @@ impl Network {
     }
 
     /// A frame that belongs to no configured node.
-    fn handle_stranger(&mut self, now: Instant, frame: &CanFrame) {
+    fn handle_stranger(&mut self, now: Instant, slot: Slot, frame: &CanFrame) {
         let id = frame.id();
-        if let Some((command, node)) = nmt_command(frame) {
+        if let Slot::Sync | Slot::Time = slot
+            && !frame.is_remote()
+        {
+            let first = self.strangers.is_first(id);
+            self.outputs.foreign(if slot == Slot::Sync {
+                ForeignEvent::Sync { produced: false, first }
+            } else {
+                ForeignEvent::Time { produced: false, first }
+            });
+        } else if let Some((command, node)) = nmt_command(frame) {
             self.outputs.foreign(ForeignEvent::NmtCommand { command, node });
             let Some(request) = NmtRequest::from_code(command) else { return };
             for each in self.nodes.iter_mut().filter(|each| node == 0 || each.id.get() == node) {

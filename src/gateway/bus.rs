@@ -404,6 +404,8 @@ impl Gateway {
                         format!("somebody else sent NMT command 0x{command:02X} to node {node} (0 = all)");
                 });
             }
+            ForeignEvent::Sync { first, .. } => self.foreign_broadcast(now, index, "SYNC", *first),
+            ForeignEvent::Time { first, .. } => self.foreign_broadcast(now, index, "TIME", *first),
             ForeignEvent::UnknownId { id, node, first } => {
                 self.count_foreign_frame(index);
                 if *first {
@@ -416,6 +418,16 @@ impl Gateway {
                     });
                 }
             }
+        }
+    }
+
+    /// A SYNC or TIME that belongs to no configured node, as an unknown identifier does.
+    fn foreign_broadcast(&mut self, now: Now, index: BusIndex, what: &'static str, first: bool) {
+        self.count_foreign_frame(index);
+        if first {
+            self.tell_bus(now, index, "unknown_id", |event| {
+                event.text = format!("somebody else sends {what}");
+            });
         }
     }
 

@@ -46,8 +46,8 @@ fn unknown_identifiers_are_new_once_and_the_memory_for_them_is_bounded() {
     assert_eq!(
         bench.take(),
         [
-            "2 UnknownId { id: 080, node: None, first: true }",
-            "3 UnknownId { id: 080, node: None, first: false }",
+            "2 Sync { produced: false, first: true }",
+            "3 Sync { produced: false, first: false }",
             "4 UnknownId { id: 17F, node: None, first: true }",
             "5 UnknownId { id: 682, node: None, first: true }",
             "6 UnknownId { id: 7E5, node: None, first: true }",
