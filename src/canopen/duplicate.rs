@@ -148,6 +148,7 @@ mod tests {
             length: 8,
             strict_length: false,
             timeout: None,
+            synchronous: false,
             shortest_period: Some(Duration::from_millis(100)),
         }])
     }

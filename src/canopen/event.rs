@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::boot::BootEvent;
 use super::sdo::{SdoError, TransferId};
-use super::{NmtRequest, NmtState, NodeId, PdoIndex};
+use super::{NmtRequest, NmtState, NodeId, PdoIndex, RpdoIndex};
 use crate::can::{CanFrame, CanId};
 
 /// Output of [`Network`](super::Network).
@@ -50,6 +50,29 @@ pub enum NodeEvent {
         pdo: PdoIndex,
         /// The believed state.
         state: Option<NmtState>,
+    },
+    /// A synchronous TPDO came later after SYNC than the window allows; its own event precedes.
+    PdoOutsideWindow {
+        /// Which.
+        pdo: PdoIndex,
+        /// How long after SYNC.
+        after: Duration,
+    },
+    /// The node takes part from now on, so that it is sent its RPDOs: it is operational, configured, and was heard.
+    RpdosStarted,
+    /// The node takes part no longer: it is sent no RPDO.
+    RpdosStopped,
+    /// An RPDO is sent to the node.
+    RpdoSent {
+        /// Which.
+        rpdo: RpdoIndex,
+        /// What; of it the first bytes, as many as it has.
+        data: [u8; 8],
+    },
+    /// An RPDO did not leave. One that is not sent after SYNC is tried again.
+    RpdoNotSent {
+        /// Which.
+        rpdo: RpdoIndex,
     },
     /// The first sign of life since the gateway started, or since `NeverSeen`.
     Seen,

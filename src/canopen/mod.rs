@@ -17,11 +17,14 @@
 //! - [`event`]: what a network tells.
 //! - [`boot`]: what is done with a node before it is started.
 //! - [`polls`]: objects that are read again and again.
-//! - `guarding`, `heartbeat`, `start`, `pdo`, `duplicate`: one machine each, for one node.
+//! - `guarding`, `heartbeat`, `start`, `pdo`, `rpdo`, `duplicate`: one machine each, for one node.
+//! - `broadcasts`: SYNC and TIME, what is sent to everybody by the clock; `beat`: that clock.
 //! - `node`: one node, made of those machines.
 //! - `network`: all nodes of a bus; dispatches frames.
 
+mod beat;
 pub mod boot;
+mod broadcasts;
 pub mod census;
 pub mod cob_id;
 mod duplicate;
@@ -37,6 +40,7 @@ mod outputs;
 mod pdo;
 pub mod polls;
 pub mod probe;
+mod rpdo;
 pub mod sdo;
 pub mod settings;
 mod start;
@@ -47,8 +51,8 @@ pub use event::{ForeignEvent, NetworkOutput, NodeEvent};
 pub use network::Network;
 pub use nmt::{NmtRequest, NmtState};
 pub use settings::{
-    ErrorControl, GuardingSettings, NetworkSettings, NodeSettings, PdoIndex, PdoSettings, Role,
-    StartSettings, TogglePolicy,
+    ErrorControl, GuardingSettings, NetworkSettings, NodeSettings, PdoIndex, PdoSettings, Role, RpdoIndex,
+    RpdoSettings, RpdoTrigger, StartSettings, SyncSettings, TimeSettings, TogglePolicy,
 };
 
 #[cfg(test)]

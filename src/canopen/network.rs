@@ -3,11 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+use super::broadcasts::Broadcasts;
 use super::node::{Node, SdoRefused};
 use super::outputs::Outputs;
 use super::sdo::{SdoRequest, TransferId};
 use super::{
-    ErrorControl, ForeignEvent, NetworkOutput, NetworkSettings, NmtRequest, NodeId, PdoIndex, Role, cob_id,
+    ErrorControl, ForeignEvent, NetworkOutput, NetworkSettings, NmtRequest, NodeEvent, NodeId, PdoIndex, Role,
+    RpdoIndex, cob_id,
 };
 use crate::can::{CanFrame, CanId};
 use crate::time::{Instant, Now};
@@ -30,8 +32,11 @@ pub struct Network {
     /// The same for 29 bits, where a TPDO has such an identifier.
     extended: BTreeMap<u32, Slot>,
     strangers: Strangers,
+    broadcasts: Broadcasts,
     outputs: Outputs,
     link_up: bool,
+    /// The wall clock of the host is right.
+    clock_synchronised: bool,
     /// Not later than the earliest deadline of all nodes.
     next: Option<(Instant, &'static str)>,
 }
@@ -95,8 +100,10 @@ impl Network {
             standard: vec![Slot::Unknown; STANDARD_IDS],
             extended: BTreeMap::new(),
             strangers: Strangers { standard: vec![false; STANDARD_IDS], extended: BTreeSet::new() },
+            broadcasts: Broadcasts::new(settings.role, settings.sync, settings.time),
             outputs: Outputs::new(),
             link_up: false,
+            clock_synchronised: false,
             next: None,
         };
         let mut pdos = Vec::new();
@@ -118,8 +125,9 @@ impl Network {
             node.pause();
             network.nodes.push(node);
         }
-        network.claim(cob_id::SYNC, Slot::Sync);
-        network.claim(cob_id::TIME, Slot::Time);
+        let [sync, time] = network.broadcasts.ids();
+        network.claim(sync, Slot::Sync);
+        network.claim(time, Slot::Time);
         for (id, slot) in pdos {
             network.claim(id, slot);
         }
@@ -138,6 +146,9 @@ impl Network {
             (Slot::Emergency(_), Some(node)) => node.handle_emergency(at, frame, outputs),
             (Slot::Pdo(_, pdo), Some(node)) => {
                 node.handle_pdo(at, pdo, frame, outputs);
+                if let Some(after) = self.broadcasts.outside_window(at).filter(|_| node.is_synchronous(pdo)) {
+                    outputs.node(node.id, NodeEvent::PdoOutsideWindow { pdo, after });
+                }
                 false
             }
             (Slot::SdoAnswer(_), Some(node)) => {
@@ -154,6 +165,9 @@ impl Network {
         {
             // It was on its way when the bus went down: it counts, but sets no clock going.
             node.pause();
+        }
+        if let Some(node) = &mut node {
+            node.drive_rpdos(at, outputs);
         }
         let moved = node.as_mut().map(|node| node.take_moved()).unwrap_or_default();
         self.next = earlier(self.next, node.and_then(|node| node.poll_timeout()));
@@ -179,7 +193,11 @@ impl Network {
                 node.command_not_sent(now.instant, request);
             }
         } else {
-            self.nodes.iter_mut().for_each(|node| node.sdo_not_sent(frame));
+            let outputs = &mut self.outputs;
+            for node in &mut self.nodes {
+                node.sdo_not_sent(frame);
+                node.rpdo_not_sent(now.instant, frame, outputs);
+            }
         }
         self.look_ahead();
     }
@@ -196,8 +214,31 @@ impl Network {
             } else {
                 node.pause();
             }
+            node.drive_rpdos(now.instant, &mut self.outputs);
+        }
+        if up {
+            self.broadcasts.resume(now.instant, self.clock_synchronised);
+        } else {
+            self.broadcasts.pause();
         }
         self.look_ahead();
+    }
+
+    /// Whether the wall clock of the host is right, so that TIME may be sent. At the start it is not.
+    pub fn handle_clock(&mut self, now: Now, synchronised: bool) {
+        self.clock_synchronised = synchronised;
+        if self.link_up {
+            self.broadcasts.set_clock(now.instant, synchronised);
+            self.look_ahead();
+        }
+    }
+
+    /// What an RPDO of a node carries from now on; `None` where one of its values is not known, so that it is not sent.
+    pub fn set_rpdo(&mut self, now: Now, node: NodeId, rpdo: RpdoIndex, data: Option<[u8; 8]>) {
+        if let Some(node) = self.nodes.iter_mut().find(|each| each.id == node) {
+            node.set_rpdo(now.instant, rpdo, data, &mut self.outputs);
+            self.next = earlier(self.next, node.poll_timeout());
+        }
     }
 
     /// An NMT command that an operator asked for, for one node or all.
@@ -212,6 +253,7 @@ impl Network {
         self.outputs.transmit(request.frame(node));
         for each in self.nodes.iter_mut().filter(|each| node.is_none_or(|id| each.id == id)) {
             each.command_sent(now.instant, request, true, &mut self.outputs);
+            each.drive_rpdos(now.instant, &mut self.outputs);
         }
         self.look_ahead();
         true
@@ -236,6 +278,13 @@ impl Network {
     /// What became due.
     pub fn handle_timeout(&mut self, now: Now) {
         let at = now.instant;
+        if let Some(frame) = self.broadcasts.take_sync(at) {
+            self.outputs.transmit(frame);
+            self.sync(at);
+        }
+        if let Some(frame) = self.broadcasts.take_time(now) {
+            self.outputs.transmit(frame);
+        }
         for place in 0..self.nodes.len() {
             let Some(node) = self.nodes.get_mut(place) else { continue };
             let due = node.poll_timeout().is_some_and(|(deadline, _)| deadline <= at);
@@ -243,6 +292,7 @@ impl Network {
                 continue;
             }
             let start = node.handle_timeout(at, &mut self.outputs);
+            node.drive_rpdos(at, &mut self.outputs);
             let moved = node.take_moved();
             self.move_pdos(place, &moved);
             if start {
@@ -283,6 +333,13 @@ impl Network {
         }
     }
 
+    /// A SYNC went over the bus: what is to follow it is sent now.
+    fn sync(&mut self, now: Instant) {
+        for node in &mut self.nodes {
+            node.handle_sync(now, &mut self.outputs);
+        }
+    }
+
     /// TPDOs of a node have other identifiers than before (R-DST-119). One that is somebody else's stays so.
     fn move_pdos(&mut self, place: usize, moved: &[(PdoIndex, Option<CanId>)]) {
         for (pdo, id) in moved {
@@ -305,11 +362,16 @@ impl Network {
             && !frame.is_remote()
         {
             let first = self.strangers.is_first(id);
-            self.outputs.foreign(if slot == Slot::Sync {
-                ForeignEvent::Sync { produced: false, first }
-            } else {
-                ForeignEvent::Time { produced: false, first }
-            });
+            if slot == Slot::Time {
+                let produced = self.broadcasts.produces_time();
+                return self.outputs.foreign(ForeignEvent::Time { produced, first });
+            }
+            let produced = self.broadcasts.produces_sync();
+            self.outputs.foreign(ForeignEvent::Sync { produced, first });
+            if !produced && self.link_up {
+                self.broadcasts.heard_sync(now);
+                self.sync(now);
+            }
         } else if let Some((command, node)) = nmt_command(frame) {
             self.outputs.foreign(ForeignEvent::NmtCommand { command, node });
             let Some(request) = NmtRequest::from_code(command) else { return };
@@ -356,7 +418,8 @@ impl Network {
     }
 
     fn look_ahead(&mut self) {
-        self.next = self.nodes.iter().filter_map(Node::poll_timeout).min_by_key(|(at, _)| *at);
+        let nodes = self.nodes.iter().filter_map(Node::poll_timeout);
+        self.next = nodes.chain(self.broadcasts.poll_timeout()).min_by_key(|(at, _)| *at);
     }
 }
 

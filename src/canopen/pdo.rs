@@ -43,6 +43,11 @@ impl Pdos {
         }
     }
 
+    /// Whether one follows SYNC.
+    pub(super) fn is_synchronous(&self, index: PdoIndex) -> bool {
+        self.pdos.get(index.0).is_some_and(|pdo| pdo.settings.synchronous)
+    }
+
     /// A frame of this length came. A discarded one does not count as received. `None`: there is no such TPDO.
     pub(super) fn receive(&mut self, now: Instant, index: PdoIndex, dlc: u8) -> Option<Length> {
         let pdo = self.pdos.get_mut(index.0)?;
@@ -108,6 +113,7 @@ mod tests {
             length,
             strict_length,
             timeout: Some(Duration::from_millis(1500)),
+            synchronous: false,
             shortest_period: None,
         });
         Pdos::new(settings.collect())

@@ -26,8 +26,38 @@ pub struct NetworkSettings {
     pub role: Role,
     /// Start all nodes with one broadcast instead of one by one (R-DET-018). Off unless asked for.
     pub start_broadcast: bool,
+    /// SYNC, where it is told of; else it is 0x080 and somebody else's.
+    pub sync: Option<SyncSettings>,
+    /// TIME, where the gateway sends it; else it is 0x100 and somebody else's.
+    pub time: Option<TimeSettings>,
     /// The nodes; at most one for each node id (R-DET-004), no COB-ID twice. Of two equal ones the first counts.
     pub nodes: Vec<NodeSettings>,
+}
+
+/// SYNC on a bus (CiA 301, R-DST-045).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SyncSettings {
+    /// Its identifier.
+    pub cob_id: CanId,
+    /// Whether the gateway sends it. In the passive role it never does.
+    pub produced: bool,
+    /// Time between two; `None` where somebody else sends it and it is not known. Nothing is sent without.
+    pub period: Option<Duration>,
+    /// Highest number of its counter, 2..=240; `None`: it carries no data.
+    pub overflow: Option<u8>,
+    /// How long after SYNC synchronous TPDOs may come; `None`: that is not looked at.
+    pub window: Option<Duration>,
+}
+
+/// TIME on a bus (CiA 301): the UTC of the host. Sent in the role master only.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TimeSettings {
+    /// Its identifier.
+    pub cob_id: CanId,
+    /// Time between two.
+    pub period: Duration,
+    /// Send it also while it is not known whether the clock of the host is right.
+    pub unsynchronised: bool,
 }
 
 /// One node.
@@ -47,6 +77,8 @@ pub struct NodeSettings {
     pub polls: Vec<Poll>,
     /// The TPDOs that it sends, in the order of the mapping; [`PdoIndex`] counts in it.
     pub pdos: Vec<PdoSettings>,
+    /// The RPDOs that it is sent; [`RpdoIndex`] counts in it. None unless the configuration allows it.
+    pub rpdos: Vec<RpdoSettings>,
     /// How long after the start of the gateway a node that showed no frame at all is reported (R-DET-001).
     pub never_seen_after: Duration,
 }
@@ -54,6 +86,10 @@ pub struct NodeSettings {
 /// Which TPDO of a node, by its place in [`NodeSettings::pdos`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct PdoIndex(pub usize);
+
+/// Which RPDO of a node, by its place in [`NodeSettings::rpdos`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct RpdoIndex(pub usize);
 
 /// How the life of a node is watched; guarding and heartbeat exclude each other (R-DET-044).
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -156,6 +192,34 @@ pub struct PdoSettings {
     pub strict_length: bool,
     /// Stale after this long while the node is operational; `None` = not supervised (R-DET-082).
     pub timeout: Option<Duration>,
+    /// It follows SYNC (transmission types 0 to 240).
+    pub synchronous: bool,
     /// Expected time between two frames, where it is known: a rate of over 1.5 times that of the shortest is suspicious.
     pub shortest_period: Option<Duration>,
+}
+
+/// One RPDO: what the gateway sends a node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RpdoSettings {
+    /// RPDO number, 1-based, for messages.
+    pub number: u16,
+    /// Its identifier, with the node id already added.
+    pub cob_id: CanId,
+    /// Bytes, 1..=8.
+    pub length: u8,
+    /// When it is sent.
+    pub trigger: RpdoTrigger,
+    /// Send it again after this long without a change; with [`RpdoTrigger::Event`] only.
+    pub refresh: Option<Duration>,
+    /// At least this long between two frames, whatever changes.
+    pub inhibit: Duration,
+}
+
+/// When an RPDO is sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RpdoTrigger {
+    /// When it changes (transmission types 254 and 255).
+    Event,
+    /// After every so many SYNCs, 1..=240; 0: after the next SYNC when it changed.
+    Sync(u8),
 }

@@ -26,6 +26,7 @@ impl Gateway {
             }
             BootEvent::Begun => self.withhold(at.1),
             BootEvent::Mapped(mapped) => self.mapped(at, mapped),
+            BootEvent::RpdoMapped(mapped) => self.rpdo_mapped(at, mapped),
             BootEvent::Done { written } => {
                 self.change(at.1, |node| {
                     node.boot_trouble = None;

@@ -52,8 +52,8 @@ pub(super) struct Bus {
 
 impl Bus {
     pub(super) fn new(table: &TagTable, index: BusIndex, now: Now) -> Self {
-        let (role, start_broadcast) =
-            table.buses.get(index.0).map_or((Role::Passive, false), |bus| (bus.role, bus.start_broadcast));
+        let def = table.buses.get(index.0);
+        let role = def.map_or(Role::Passive, |bus| bus.role);
         let mut by_id = vec![None; 128];
         let mut members = Vec::new();
         let mut nodes: Vec<NodeSettings> = Vec::new();
@@ -66,7 +66,16 @@ impl Bus {
         }
         let shortest_silence = silence(nodes.iter()).unwrap_or(SILENCE);
         Self {
-            network: Network::new(NetworkSettings { role, start_broadcast, nodes }, now),
+            network: Network::new(
+                NetworkSettings {
+                    role,
+                    start_broadcast: def.is_some_and(|bus| bus.start_broadcast),
+                    sync: def.and_then(|bus| bus.sync),
+                    time: def.and_then(|bus| bus.time),
+                    nodes,
+                },
+                now,
+            ),
             status: BusStatus::default(),
             role,
             link: None,
@@ -404,8 +413,16 @@ impl Gateway {
                         format!("somebody else sent NMT command 0x{command:02X} to node {node} (0 = all)");
                 });
             }
-            ForeignEvent::Sync { first, .. } => self.foreign_broadcast(now, index, "SYNC", *first),
-            ForeignEvent::Time { first, .. } => self.foreign_broadcast(now, index, "TIME", *first),
+            ForeignEvent::Sync { produced, first } => {
+                // Somebody who was told of is nobody to tell of.
+                let def = self.table.buses.get(index.0);
+                if *produced || def.is_none_or(|bus| bus.sync.is_none()) {
+                    self.foreign_broadcast(now, index, "SYNC", *produced, *first);
+                }
+            }
+            ForeignEvent::Time { produced, first } => {
+                self.foreign_broadcast(now, index, "TIME", *produced, *first);
+            }
             ForeignEvent::UnknownId { id, node, first } => {
                 self.count_foreign_frame(index);
                 if *first {
@@ -421,12 +438,18 @@ impl Gateway {
         }
     }
 
-    /// A SYNC or TIME that belongs to no configured node, as an unknown identifier does.
-    fn foreign_broadcast(&mut self, now: Now, index: BusIndex, what: &'static str, first: bool) {
+    /// SYNC or TIME of somebody else: of a second producer, or of one that the configuration does not know.
+    fn foreign_broadcast(&mut self, now: Now, index: BusIndex, what: &'static str, produced: bool, first: bool) {
         self.count_foreign_frame(index);
-        if first {
+        if produced {
+            self.conditions.pulse(now, AlarmOwner::Bus(index), BuiltIn::ForeignProducer);
+            let name = if what == "SYNC" { "foreign_sync" } else { "foreign_time" };
+            self.tell_bus(now, index, name, |event| {
+                event.text = format!("somebody else sends {what}, which this gateway sends too");
+            });
+        } else if first {
             self.tell_bus(now, index, "unknown_id", |event| {
-                event.text = format!("somebody else sends {what}");
+                event.text = format!("{what} comes from somebody else");
             });
         }
     }

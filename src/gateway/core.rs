@@ -277,6 +277,11 @@ impl Gateway {
                 word(health.mqtt_connected).clone_into(&mut event.to);
             });
         }
+        for bus in (0..self.buses.len()).map(BusIndex) {
+            if let Some(bus) = self.buses.get_mut(bus.0) {
+                bus.network.handle_clock(now, health.clock_synchronised);
+            }
+        }
         let down = health.mqtt_connected == Some(false);
         self.conditions.set(now, AlarmOwner::Gateway, BuiltIn::MqttDown, down);
         self.settle(now);

@@ -6,6 +6,7 @@
 //! - [`command`]: what a northbound can ask for. `operate`: what comes of it.
 //! - `core`: the four verbs.
 //! - `bus`: one bus; `node` and `node_event`: one node.
+//! - `supply`: what nodes are sent in RPDOs.
 //! - `tags`: the value of every tag; `derived`: computed tags.
 //! - `conditions`: what raises alarms. `events`: on the way to the journal.
 //! - `marks`: which places changed.
@@ -26,6 +27,7 @@ mod node;
 mod node_event;
 mod operate;
 pub mod replay;
+mod supply;
 mod tags;
 pub mod task;
 

@@ -27,6 +27,16 @@ impl Gateway {
                 self.pdo_length(at, pdo, received, discarded);
             }
             NodeEvent::PdoTimeout { pdo } => self.pdo_timeout(at, pdo),
+            NodeEvent::PdoOutsideWindow { pdo, after } => {
+                let number = self.pdo_number(index, pdo);
+                self.tell(at, "pdo_outside_window", |event| {
+                    event.text = format!("TPDO{number} came {} us after SYNC", after.as_micros());
+                });
+            }
+            NodeEvent::RpdosStarted => self.rpdos_started(at),
+            NodeEvent::RpdosStopped => self.rpdos_stopped(at),
+            NodeEvent::RpdoSent { rpdo, data } => return self.rpdo_sent(at, rpdo, data),
+            NodeEvent::RpdoNotSent { rpdo } => return self.rpdo_not_sent(at, rpdo),
             NodeEvent::PdoInUnexpectedState { pdo, state } => self.pdo_in_unexpected_state(at, pdo, state),
             NodeEvent::Malformed { frame } => self.malformed(at, &frame),
             NodeEvent::Seen => self.seen(at),

@@ -152,6 +152,18 @@ pub const OF_BUS: &[BuiltinAlarm] = &[
         text: "Somebody else sends NMT commands on this bus.",
         action: "Find the other master; make one of the two passive.",
     },
+    BuiltinAlarm {
+        name: "foreign_producer",
+        condition: BuiltIn::ForeignProducer,
+        priority: Priority::Medium,
+        on_delay_ms: 0,
+        off_delay_ms: 60_000,
+        latch: false,
+        suppressed_by: &[],
+        bit: None,
+        text: "Somebody else sends SYNC or TIME, which this gateway sends too.",
+        action: "Find the other producer; let one of the two send it ([bus.NAME.sync], [bus.NAME.time]).",
+    },
 ];
 
 /// Those of each node, a cause before what it suppresses. `pdo_timeout_{}` is there once for each TPDO.

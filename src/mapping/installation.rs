@@ -30,6 +30,10 @@ pub struct BusEntry {
     pub start_broadcast: bool,
     /// The gateway's own node id, 1..=127, where it has one: no node of this bus may use it (R-DET-004).
     pub own_node_id: Option<At<u64>>,
+    /// SYNC: the message after which synchronous PDOs are sent. Default: none.
+    pub sync: Option<At<SyncEntry>>,
+    /// TIME: tells the devices the time. Default: none.
+    pub time: Option<At<TimeEntry>>,
 }
 
 impl BusEntry {
@@ -42,8 +46,53 @@ impl BusEntry {
             bit_rate: None,
             start_broadcast: false,
             own_node_id: None,
+            sync: None,
+            time: None,
         }
     }
+}
+
+/// `[bus.NAME.sync]`.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct SyncEntry {
+    /// Who sends it. Default: gateway; in the passive role it never does.
+    #[serde(default)]
+    pub producer: ProducerWord,
+    /// Time between two, 1..=60000 ms; or `period_us`. Where another sends it: what is to be expected, if it is known.
+    pub period_ms: Option<At<u64>>,
+    /// The same in microseconds, 1000..=60000000.
+    pub period_us: Option<At<u64>>,
+    /// Its identifier; one above 0x7FF has 29 bits. Default: 0x80.
+    pub cob_id: Option<At<u64>>,
+    /// Highest number of its counter, 2..=240; 0 = no counter, so no data. Default: 0.
+    pub counter: Option<At<u64>>,
+    /// A synchronous TPDO that comes later after SYNC is told of, 1..=60000000 us; 0 = not looked at. Default: 0.
+    pub window_us: Option<At<u64>>,
+}
+
+/// `[bus.NAME.time]`.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TimeEntry {
+    /// Time between two, 1..=86400 s.
+    pub period_s: At<u64>,
+    /// Its identifier; one above 0x7FF has 29 bits. Default: 0x100.
+    pub cob_id: Option<At<u64>>,
+    /// Send it also while the clock of the host is not known to be synchronised. Default: false.
+    #[serde(default)]
+    pub unsynchronised: bool,
+}
+
+/// Who sends SYNC.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ProducerWord {
+    /// This gateway.
+    #[default]
+    Gateway,
+    /// Somebody else.
+    Other,
 }
 
 /// `role`.
@@ -115,6 +164,12 @@ pub struct NodeEntry {
     pub pdo_timeout_ms: Option<At<u64>>,
     /// For every TPDO of the node: discard frames that are too long (R-DET-081).
     pub strict_dlc: Option<bool>,
+    /// Send the node the RPDOs of its mapping. Default: false.
+    #[serde(default)]
+    pub outputs: bool,
+    /// Changes to TPDOs of the mapping, by their number.
+    #[serde(default)]
+    pub tpdo: BTreeMap<At<String>, TpdoEntry>,
     /// Changes to tags of the mapping.
     #[serde(default)]
     pub tag: BTreeMap<At<String>, TagEntry>,
@@ -134,6 +189,18 @@ impl NodeEntry {
             ..Self::default()
         }
     }
+}
+
+/// `[node.NAME.tpdo.NUMBER]`: how this installation wants a TPDO sent. Written to the device as the mapping's own keys are.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TpdoEntry {
+    /// Transmission type, 0..=255.
+    pub transmission_type: Option<At<u64>>,
+    /// Event timer, 0..=65535 ms.
+    pub event_timer_ms: Option<At<u64>>,
+    /// Inhibit time in microseconds, 0..=6553500 in steps of 100.
+    pub inhibit_time_us: Option<At<u64>>,
 }
 
 /// `[node.NAME.tag.TAG]`: what this installation changes of a tag.

@@ -153,6 +153,7 @@ fn alarm_code(alarm: &AlarmDef) -> u16 {
         AlarmCondition::BuiltIn(BuiltIn::FramesLost) => 105,
         AlarmCondition::BuiltIn(BuiltIn::HighLoad) => 106,
         AlarmCondition::BuiltIn(BuiltIn::ForeignMaster) => 107,
+        AlarmCondition::BuiltIn(BuiltIn::ForeignProducer) => 108,
         AlarmCondition::BuiltIn(BuiltIn::MqttDown) => 201,
         AlarmCondition::BuiltIn(_) | AlarmCondition::Tags(_) => u16::MAX,
     }

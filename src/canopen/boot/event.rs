@@ -36,6 +36,8 @@ pub enum BootEvent {
     },
     /// A TPDO as the node sends it, from now on.
     Mapped(MappedPdo),
+    /// An RPDO as the node takes it, from now on; its `pdo` is the place among the RPDOs of the node's settings.
+    RpdoMapped(MappedPdo),
     /// All steps are done; the node may be started.
     Done {
         /// Objects that were written.

@@ -24,6 +24,8 @@ pub use event::{BootEvent, BootFailure, MappedPdo};
 pub use settings::{BootSettings, BootStep, MappingMode, PdoSetup};
 
 use self::task::{Advance, Task};
+use super::RpdoIndex;
+use super::object::MappedObject;
 use super::sdo::{SdoError, SdoRequest, TransferId};
 use crate::time::Instant;
 
@@ -117,6 +119,11 @@ impl Boot {
     pub(super) fn handle_recovered(&mut self, now: Instant) {
         self.failures = 0;
         self.restart(now + SETTLE);
+    }
+
+    /// What an RPDO is to carry, where the node is asked.
+    pub(super) fn wants_rpdo(&self, rpdo: RpdoIndex) -> Option<&[MappedObject]> {
+        self.settings.setup_of_rpdo(rpdo).map(|setup| setup.maps.as_slice())
     }
 
     /// Whether there is nothing to do at all.

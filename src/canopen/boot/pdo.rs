@@ -1,4 +1,6 @@
-//! The step that reads a TPDO's parameters and changes them where asked (R-DST-020..024, R-DST-119).
+//! The step that reads a PDO's parameters and changes them where asked (R-DST-020..024, R-DST-119).
+//!
+//! Here told of a TPDO; with an RPDO it is the same at 0x1400 and 0x1600.
 //!
 //! Read are 0x1800:1 (COB-ID), :2 (transmission type), :3 (inhibit time), :5 (event timer) and all entries of 0x1A00. What
 //! differs is written in the order of CiA 301: the PDO may be marked not valid, 0x1A00:0 = 0, the entries, the unused ones
@@ -21,6 +23,8 @@ const MOST_ENTRIES: u8 = 64;
 #[derive(Debug)]
 pub(super) struct PdoTask {
     setup: PdoSetup,
+    /// It is an RPDO.
+    received: bool,
     phase: Phase,
     found: Found,
     /// What is still to be written, the next one last.
@@ -60,9 +64,11 @@ struct Found {
 }
 
 impl PdoTask {
-    pub(super) fn new(setup: PdoSetup) -> Self {
+    /// `received`: it is an RPDO of the node.
+    pub(super) fn new(setup: PdoSetup, received: bool) -> Self {
         Self {
             setup,
+            received,
             phase: Phase::Begin,
             found: Found::default(),
             writes: Vec::new(),
@@ -92,11 +98,13 @@ impl PdoTask {
     }
 
     fn communication(&self, sub: u8) -> ObjectId {
-        ObjectId::new(0x1800_u16.saturating_add(self.setup.number.saturating_sub(1)), sub)
+        let first: u16 = if self.received { 0x1400 } else { 0x1800 };
+        ObjectId::new(first.saturating_add(self.setup.number.saturating_sub(1)), sub)
     }
 
     fn mapping(&self, sub: u8) -> ObjectId {
-        ObjectId::new(0x1A00_u16.saturating_add(self.setup.number.saturating_sub(1)), sub)
+        let first: u16 = if self.received { 0x1600 } else { 0x1A00 };
+        ObjectId::new(first.saturating_add(self.setup.number.saturating_sub(1)), sub)
     }
 
     fn read(&mut self, phase: Phase) -> Advance {
@@ -171,6 +179,9 @@ impl PdoTask {
             return self.tell();
         }
         if self.setup.mode == MappingMode::Verify {
+            if self.received {
+                return self.tell();
+            }
             self.phase = Phase::Deviation;
             return Advance::Tell(BootEvent::Deviation { pdo: self.setup.pdo });
         }
@@ -234,13 +245,14 @@ impl PdoTask {
         } else {
             CanId::extended(found.cob_id & 0x1FFF_FFFF)
         };
-        Advance::Tell(BootEvent::Mapped(MappedPdo {
+        let mapped = MappedPdo {
             pdo: self.setup.pdo,
             cob_id: cob_id.filter(|_| found.cob_id & NOT_VALID == 0),
             maps: std::mem::take(&mut found.maps),
             transmission_type: found.transmission_type,
             event_timer: found.event_timer.unwrap_or_default(),
-        }))
+        };
+        Advance::Tell(if self.received { BootEvent::RpdoMapped(mapped) } else { BootEvent::Mapped(mapped) })
     }
 }
 

@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use crate::canopen::PdoIndex;
 use crate::canopen::object::{MappedObject, ObjectId};
+use crate::canopen::{PdoIndex, RpdoIndex};
 
 /// How a node is booted.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -23,6 +23,21 @@ impl BootSettings {
         self.steps.iter().find_map(|step| match step {
             BootStep::Pdo(setup) if setup.pdo == pdo => Some(setup),
             BootStep::Pdo(_)
+            | BootStep::Rpdo(_)
+            | BootStep::Identity { .. }
+            | BootStep::Read { .. }
+            | BootStep::Write { .. }
+            | BootStep::Save => None,
+        })
+    }
+
+    /// What is done with an RPDO, if anything.
+    #[must_use]
+    pub fn setup_of_rpdo(&self, rpdo: RpdoIndex) -> Option<&PdoSetup> {
+        self.steps.iter().find_map(|step| match step {
+            BootStep::Rpdo(setup) if setup.pdo.0 == rpdo.0 => Some(setup),
+            BootStep::Pdo(_)
+            | BootStep::Rpdo(_)
             | BootStep::Identity { .. }
             | BootStep::Read { .. }
             | BootStep::Write { .. }
@@ -69,16 +84,18 @@ pub enum BootStep {
     },
     /// Reads a TPDO's communication and mapping parameters and tells them; changes them first where it is asked to.
     Pdo(PdoSetup),
+    /// The same for an RPDO; its `pdo` is the place among the RPDOs of the node's settings.
+    Rpdo(PdoSetup),
     /// Stores all parameters in the node (0x1010:1), if any of the steps before wrote something.
     Save,
 }
 
-/// A TPDO as it should be.
+/// A TPDO, or RPDO, as it should be.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PdoSetup {
     /// Which, by its place in the node's settings.
     pub pdo: PdoIndex,
-    /// TPDO number, 1..=512: its objects are 0x1800 and 0x1A00 plus this number less one.
+    /// Its number, 1..=512: its objects are 0x1800 and 0x1A00, of an RPDO 0x1400 and 0x1600, plus this number less one.
     pub number: u16,
     /// What is done where the node has it otherwise.
     pub mode: MappingMode,

@@ -91,7 +91,8 @@ impl Task {
                 optional: *optional,
                 phase: WritePhase::Begin,
             }),
-            BootStep::Pdo(setup) => Self::Pdo(PdoTask::new(setup.clone())),
+            BootStep::Pdo(setup) => Self::Pdo(PdoTask::new(setup.clone(), false)),
+            BootStep::Rpdo(setup) => Self::Pdo(PdoTask::new(setup.clone(), true)),
             BootStep::Save => Self::Save { needed: written > 0 },
         }
     }

@@ -2,9 +2,11 @@
 //!
 //! This file joins the machines and runs their clocks.
 //!
-//! - `watch`: how its life is watched. `reception`: what its frames mean. `transfers`: what it is asked by SDO.
+//! - `watch`: how its life is watched. `reception`: what its frames mean. `transfers`: what it is asked by SDO. `supply`:
+//!   what it is sent in RPDOs.
 
 mod reception;
+mod supply;
 mod transfers;
 mod watch;
 
@@ -16,6 +18,7 @@ use super::guarding::Failure;
 use super::outputs::Outputs;
 use super::pdo::Pdos;
 use super::polls::Polls;
+use super::rpdo::Rpdos;
 use super::sdo::{Refused, SdoClient};
 use super::start::Start;
 use super::{NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex, Role, cob_id};
@@ -39,6 +42,9 @@ pub(super) struct Node {
     /// TPDOs of which the node has told another identifier.
     moved: Vec<(PdoIndex, Option<CanId>)>,
     pub(super) pdos: Pdos,
+    rpdos: Rpdos,
+    /// A frame of it came since the bus can be used.
+    heard: bool,
     pub(super) duplicate: Duplicate,
     /// Started by nobody: its TPDOs may follow its boot-up message at once.
     pub(super) self_starting: bool,
@@ -94,6 +100,8 @@ impl Node {
             moved: Vec::new(),
             duplicate: Duplicate::new(&settings.pdos),
             pdos: Pdos::new(settings.pdos),
+            rpdos: Rpdos::new(settings.rpdos),
+            heard: false,
             state: None,
             ordered: None,
             before: None,
@@ -237,6 +245,7 @@ impl Node {
         self.pdos.stop();
         self.never_seen_at = None;
         self.supervised = false;
+        self.heard = false;
     }
 
     /// The bus can be used again: as at the start, but what was known stays known.
@@ -328,6 +337,7 @@ impl Node {
             self.boot.poll_timeout(),
             self.polls.poll_timeout(),
             self.pdos.poll_timeout(),
+            self.rpdos.poll_timeout(),
             self.duplicate.poll_timeout(),
             never_seen,
             foreign_guard,
@@ -360,6 +370,7 @@ impl Node {
     pub(super) fn frame_seen(&mut self, now: Instant, outputs: &mut Outputs) {
         outputs.node(self.id, NodeEvent::FrameSeen);
         self.boot.handle_alive(now);
+        self.heard = true;
         if !self.seen {
             self.seen = true;
             self.never_seen_at = None;

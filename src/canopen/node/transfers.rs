@@ -7,7 +7,7 @@ use super::super::outputs::Outputs;
 use super::super::polls::Polls;
 use super::super::sdo::{SdoClient, SdoError, SdoOutput, SdoRequest, TransferId};
 use super::super::start::Start;
-use super::super::{NmtRequest, NmtState, NodeEvent, PdoIndex};
+use super::super::{NmtRequest, NmtState, NodeEvent, PdoIndex, RpdoIndex};
 use super::watch::Watch;
 use super::{Node, SdoRefused};
 use crate::can::{CanFrame, CanId};
@@ -99,6 +99,9 @@ impl Node {
                 if let BootEvent::Mapped(mapped) = &event {
                     self.pdos.set_length(mapped.pdo, mapped.length());
                     self.moved.push((mapped.pdo, mapped.cob_id));
+                }
+                if let BootEvent::RpdoMapped(mapped) = &event {
+                    self.rpdo_mapped(now, RpdoIndex(mapped.pdo.0), mapped.cob_id, &mapped.maps);
                 }
                 let done = matches!(event, BootEvent::Done { .. });
                 outputs.node(self.id, NodeEvent::Boot(event));

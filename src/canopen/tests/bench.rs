@@ -116,6 +116,7 @@ pub(super) fn detcon(id: u8) -> NodeSettings {
         length,
         strict_length: false,
         timeout: Some(Duration::from_millis(1500)),
+        synchronous: false,
         shortest_period: Some(Duration::from_millis(100)),
     };
     NodeSettings {
@@ -126,6 +127,7 @@ pub(super) fn detcon(id: u8) -> NodeSettings {
         boot: BootSettings::default(),
         polls: Vec::new(),
         pdos: [(1, 8), (2, 8), (3, 8), (4, 6)].into_iter().map(pdo).collect(),
+        rpdos: Vec::new(),
         never_seen_after: Duration::from_secs(10),
     }
 }

@@ -141,6 +141,7 @@ impl Plant {
                 length: 8,
                 strict_length: false,
                 timeout: None,
+                synchronous: false,
                 shortest_period: None,
             }],
             ..detcon(1)

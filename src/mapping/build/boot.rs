@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use super::super::At;
 use super::super::file::{MappingWord, SetupSection, SetupValue};
+use super::super::{At, SourceText};
 use super::items::Entry;
 use super::node;
 use super::problems::Problems;
@@ -35,15 +35,17 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
             MappingWord::Write => MappingMode::Write,
             MappingWord::Verify => MappingMode::Verify,
         };
-        let mut number = |at: &Option<At<u64>>, what: &str, highest: u64| {
-            at.as_ref().map(|at| problems.within(context.source, at, what, 0..=highest))
+        let mut number = |at: Option<(&SourceText, &At<u64>)>, what: &str, highest: u64| {
+            at.map(|(source, at)| problems.within(source, at, what, 0..=highest))
         };
-        let transmission_type = number(&section.transmission_type, "transmission_type", 255);
-        let event_timer = number(&section.event_timer_ms, "event_timer_ms", 65_535);
-        let inhibit_time = number(&section.inhibit_time_us, "inhibit_time_us", 6_553_500);
-        if let Some(at) = section.inhibit_time_us.as_ref().filter(|at| !at.value.is_multiple_of(100)) {
+        let transmission_type = number(tpdo.transmission_type(context), "transmission_type", 255);
+        let event_timer = number(tpdo.event_timer(context), "event_timer_ms", 65_535);
+        let inhibit_time = number(tpdo.inhibit_time(context), "inhibit_time_us", 6_553_500);
+        if let Some((source, at)) =
+            tpdo.inhibit_time(context).filter(|(_, at)| !at.value.is_multiple_of(100))
+        {
             let message = format!("inhibit_time_us {} cannot be set", at.value);
-            problems.error(context.source, &at.span, message, "devices count in steps of 100 us");
+            problems.error(source, &at.span, message, "devices count in steps of 100 us");
         }
         steps.push(BootStep::Pdo(PdoSetup {
             pdo: PdoIndex(place),

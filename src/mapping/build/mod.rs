@@ -4,6 +4,7 @@
 //! - `items`: the tags of a mapping, arrays unrolled. `tags`, `fields`, `derived`: what they become.
 //! - `node`: what the CANopen master needs to know; `boot`: what it does before it starts the node.
 //! - `alarms`: alarms, their order and what suppresses them.
+//! - `broadcasts`: SYNC and TIME of a bus; `sync`: PDOs that go with SYNC.
 //! - `addresses`, `network`: what must not happen twice among nodes.
 //! - `order`: causes before consequences. `problems`: where messages are collected.
 //! - [`sketch`]: an installation without a configuration file.
@@ -11,6 +12,7 @@
 mod addresses;
 mod alarms;
 mod boot;
+mod broadcasts;
 mod derived;
 mod fields;
 mod items;
@@ -19,6 +21,7 @@ mod node;
 mod order;
 mod problems;
 pub mod sketch;
+mod sync;
 mod tags;
 #[cfg(test)]
 mod tests;
@@ -35,7 +38,7 @@ pub use self::problems::{is_name, is_snake_case, sort_problems};
 pub use self::sketch::Sketch;
 use self::tags::Context;
 use super::file::MappingFile;
-use super::installation::{BusEntry, NodeEntry};
+use super::installation::{BusEntry, NodeEntry, ProducerWord, SyncEntry};
 use super::reader::{self, Read};
 use super::shipped::{SHIPPED, shipped};
 use super::suggest::closest;
@@ -47,6 +50,9 @@ use crate::process_image::{NodeIndex, TagIndex};
 
 /// Version of the mapping format that this program reads.
 pub const FORMAT: u64 = 1;
+
+/// The period of SYNC, in ms, on a bus that is not known.
+const SYNC_OF_A_CHECK: u64 = 100;
 
 /// All that an installation is made of.
 #[derive(Clone, Copy, Debug)]
@@ -83,6 +89,9 @@ pub fn build(installation: &Installation<'_>) -> Result<(TagTable, Vec<Diagnosti
         taken: Taken::default(),
         claims: Vec::new(),
     };
+    for (index, bus) in builder.table.buses.iter().enumerate() {
+        builder.taken.broadcasts(BusIndex(index), bus);
+    }
     for (name, entry) in installation.nodes {
         builder.node(&mut problems, &files, name, entry);
     }
@@ -92,7 +101,14 @@ pub fn build(installation: &Installation<'_>) -> Result<(TagTable, Vec<Diagnosti
 
 /// Checks one mapping by itself, as if one node of an installation used it. Warnings, or everything that is wrong.
 pub fn check_mapping(source: &SourceText) -> Result<Vec<Diagnostic>, Vec<Diagnostic>> {
-    let sketch = Sketch::new().mapping(source.clone()).node("check", 1, &source.name, |_| ());
+    // Whether its bus has SYNC is not for the mapping to say.
+    let sync = SyncEntry {
+        producer: ProducerWord::Other,
+        period_ms: Some(At::nowhere(SYNC_OF_A_CHECK)),
+        ..SyncEntry::default()
+    };
+    let sketch = Sketch::new().bus(|bus| bus.sync = Some(At::nowhere(sync)));
+    let sketch = sketch.mapping(source.clone()).node("check", 1, &source.name, |_| ());
     sketch.build().map(|(_, warnings)| warnings)
 }
 
@@ -117,6 +133,8 @@ fn buses(problems: &mut Problems, installation: &Installation<'_>) -> Vec<BusDef
             role: entry.role.into(),
             bit_rate: bit_rate.unwrap_or(DEFAULT_BIT_RATE),
             start_broadcast: entry.start_broadcast,
+            sync: broadcasts::sync(problems, config, entry),
+            time: broadcasts::time(problems, config, entry),
         });
     }
     buses
@@ -201,7 +219,8 @@ impl Builder<'_> {
             file,
             config,
             entry,
-            tpdos: Tpdo::all(file),
+            bus: bus.and_then(|bus| self.table.buses.get(bus.0)).cloned(),
+            tpdos: Tpdo::all(file, entry),
             items,
             node: NodeIndex(self.table.nodes.len()),
             base: self.table.tags.len(),
@@ -245,6 +264,7 @@ impl Builder<'_> {
         let (tags, places) = tags::tags(problems, context);
         fields::check_overlaps(problems, context, &fields::all(context, &tags, &places));
         self.claims.push(addresses::of_node(problems, context, name, unit_id, &tags, &places));
+        sync::check_changes(problems, context);
         let canopen = node::settings(problems, context, id);
         self.taken.identifiers(problems, self.installation.config, name, bus, &canopen);
         let base = self.table.alarms.len();

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::super::installation::NodeEntry;
+use super::super::table::BusDef;
 use super::super::{At, SourceText};
 use super::Installation;
 use super::problems::Problems;
@@ -61,6 +62,15 @@ impl Taken {
         self.ignored.insert(name.value.clone());
     }
 
+    /// The identifiers of SYNC and of TIME, where the configuration tells of them.
+    pub fn broadcasts(&mut self, index: BusIndex, bus: &BusDef) {
+        let sync = bus.sync.map(|sync| ("SYNC", sync.cob_id));
+        let time = bus.time.map(|time| ("TIME", time.cob_id));
+        for (what, id) in sync.into_iter().chain(time) {
+            self.identifiers.insert((index, id), format!("{what} of bus `{}`", bus.name));
+        }
+    }
+
     /// An identifier must have one sender on its bus.
     pub fn identifiers(
         &mut self,
@@ -99,7 +109,8 @@ impl Taken {
     }
 }
 
-fn restricted(id: CanId) -> Option<&'static str> {
+/// What an identifier is kept for, so that it can be no PDO's.
+pub fn restricted(id: CanId) -> Option<&'static str> {
     let CanId::Standard(id) = id else { return None };
     let id = u32::from(id);
     RESTRICTED.iter().find(|(first, last, _)| (*first..=*last).contains(&id)).map(|(_, _, purpose)| *purpose)

@@ -5,9 +5,10 @@ use std::time::Duration;
 use super::super::At;
 use super::super::SourceText;
 use super::super::file::{MappingFile, TagSection, TpdoSection};
-use super::super::installation::ErrorControlWord;
+use super::super::installation::{ErrorControlWord, NodeEntry, TpdoEntry};
 use super::boot;
 use super::problems::Problems;
+use super::sync;
 use super::tags::Context;
 use crate::canopen::boot::BootSettings;
 use crate::canopen::object::{MappedObject, ObjectId};
@@ -18,6 +19,8 @@ use crate::canopen::{ErrorControl, GuardingSettings, NodeId, NodeSettings, PdoSe
 const NEVER_SEEN_AFTER: Duration = Duration::from_secs(5);
 /// Longest time that a TPDO may take, in ms.
 const LONGEST_PERIOD: u64 = 3_600_000;
+/// No TPDO is called late sooner than this, however fast SYNC is.
+const SHORTEST_TIMEOUT: Duration = Duration::from_millis(10);
 
 /// The settings of a node.
 pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> NodeSettings {
@@ -25,7 +28,7 @@ pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> N
     let steps = boot::steps(problems, context);
     let polls = boot::polls(problems, context);
     let pdos = context.tpdos.iter().map(|tpdo| {
-        let pdo = pdo(problems, context, id, tpdo.key, tpdo.section);
+        let pdo = pdo(problems, context, id, tpdo);
         if pdo.timeout.is_none() {
             warn_of_silence(problems, context, tpdo, error_control == ErrorControl::None);
         }
@@ -39,6 +42,7 @@ pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> N
         sdo: (!steps.is_empty() || !polls.is_empty()).then(SdoSettings::default),
         boot: BootSettings { steps, ..BootSettings::default() },
         polls,
+        rpdos: Vec::new(),
         never_seen_after: NEVER_SEEN_AFTER,
     }
 }
@@ -66,7 +70,7 @@ fn warn_of_silence(problems: &mut Problems, context: &Context<'_>, tpdo: &Tpdo<'
 }
 
 /// A number that the installation may set instead of the mapping, with the file that it stands in.
-fn either<'a>(
+pub fn either<'a>(
     context: &Context<'a>,
     installation: Option<&'a At<u64>>,
     mapping: Option<&'a At<u64>>,
@@ -162,10 +166,9 @@ fn pdo(
     problems: &mut Problems,
     context: &Context<'_>,
     id: NodeId,
-    key: &At<String>,
-    tpdo: &TpdoSection,
+    pdo: &Tpdo<'_>,
 ) -> PdoSettings {
-    let source = context.source;
+    let (source, key, tpdo) = (context.source, pdo.key, pdo.section);
     let number = key.value.parse::<u16>().ok().filter(|number| (1..=512).contains(number));
     if number.is_none_or(|number| number.to_string() != key.value) {
         let message = format!("`{}` is not the number of a TPDO", key.value);
@@ -177,10 +180,12 @@ fn pdo(
     };
     let period = millis(problems, &tpdo.period_ms, "period_ms");
     let shortest_period = millis(problems, &tpdo.shortest_period_ms, "shortest_period_ms");
+    let cycle = sync::cycle(problems, context, pdo);
     let timeout = either(context, context.entry.pdo_timeout_ms.as_ref(), tpdo.timeout_ms.as_ref());
     let timeout = match timeout {
         Some((_, at)) if at.value == 0 => None,
-        None => period.or(event_timer(tpdo)).map(|period| 3 * period),
+        None if cycle.is_synchronous => cycle.period.map(|period| (3 * period).max(SHORTEST_TIMEOUT)),
+        None => period.or(event_timer(context, pdo)).map(|period| 3 * period),
         Some((source, at)) => {
             Some(Duration::from_millis(problems.within(source, at, "timeout", 10..=LONGEST_PERIOD)))
         }
@@ -202,13 +207,15 @@ fn pdo(
         length: u8::try_from(length).unwrap_or(8),
         strict_length: context.entry.strict_dlc.unwrap_or(tpdo.strict_dlc),
         timeout,
-        shortest_period,
+        synchronous: cycle.is_synchronous,
+        shortest_period: shortest_period.map(|shortest| cycle.period.map_or(shortest, |it| it.min(shortest))),
     }
 }
 
 /// The event timer, where it runs.
-fn event_timer(tpdo: &TpdoSection) -> Option<Duration> {
-    tpdo.event_timer_ms.as_ref().map(|at| Duration::from_millis(at.value)).filter(|timer| !timer.is_zero())
+fn event_timer(context: &Context<'_>, tpdo: &Tpdo<'_>) -> Option<Duration> {
+    let (_, at) = tpdo.event_timer(context)?;
+    Some(Duration::from_millis(at.value)).filter(|timer| !timer.is_zero())
 }
 
 /// The bytes of a TPDO, from what it maps or as they are written.
@@ -281,16 +288,46 @@ pub struct Tpdo<'a> {
     pub key: &'a At<String>,
     /// Its entry.
     pub section: &'a TpdoSection,
+    /// What the installation changes of it.
+    pub changes: Option<&'a TpdoEntry>,
 }
 
 impl<'a> Tpdo<'a> {
     /// All of a mapping, by their numbers.
-    pub fn all(file: &'a MappingFile) -> Vec<Self> {
+    pub fn all(file: &'a MappingFile, entry: &'a NodeEntry) -> Vec<Self> {
         let number = |key: &At<String>| key.value.parse().unwrap_or(u64::MAX);
-        let mut all: Vec<Self> =
-            file.tpdo.iter().map(|(key, section)| Self { number: number(key), key, section }).collect();
+        let tpdo = |(key, section)| {
+            Self { number: number(key), key, section, changes: entry.tpdo.get(key) }
+        };
+        let mut all: Vec<Self> = file.tpdo.iter().map(tpdo).collect();
         all.sort_by_key(|tpdo| tpdo.number);
         all
+    }
+
+    /// Its transmission type, with the file that it stands in.
+    pub fn transmission_type<'c>(&self, context: &'c Context<'_>) -> Option<(&'c SourceText, &'a At<u64>)> {
+        self.key_of(context, |changes| &changes.transmission_type, &self.section.transmission_type)
+    }
+
+    /// Its event timer.
+    pub fn event_timer<'c>(&self, context: &'c Context<'_>) -> Option<(&'c SourceText, &'a At<u64>)> {
+        self.key_of(context, |changes| &changes.event_timer_ms, &self.section.event_timer_ms)
+    }
+
+    /// Its inhibit time.
+    pub fn inhibit_time<'c>(&self, context: &'c Context<'_>) -> Option<(&'c SourceText, &'a At<u64>)> {
+        self.key_of(context, |changes| &changes.inhibit_time_us, &self.section.inhibit_time_us)
+    }
+
+    fn key_of<'c>(
+        &self,
+        context: &'c Context<'_>,
+        changed: impl Fn(&'a TpdoEntry) -> &'a Option<At<u64>>,
+        own: &'a Option<At<u64>>,
+    ) -> Option<(&'c SourceText, &'a At<u64>)> {
+        let changed = self.changes.and_then(|changes| changed(changes).as_ref());
+        let changed = changed.map(|at| (context.config, at));
+        changed.or(own.as_ref().map(|at| (context.source, at)))
     }
 
     /// Whether its number is none.

@@ -8,7 +8,7 @@ use super::super::file::{
     TagSection,
 };
 use super::super::installation::{ByteOrderWord, NodeEntry, TagEntry};
-use super::super::table::{Derived, Encoding, FieldKind, RegisterDef, Scale, Source, Space, TagDef};
+use super::super::table::{BusDef, Derived, Encoding, FieldKind, RegisterDef, Scale, Source, Space, TagDef};
 use super::super::{At, SourceText};
 use super::items::{Element, Entry, Item, Items};
 use super::node::Tpdo;
@@ -54,6 +54,8 @@ pub struct Context<'a> {
     pub config: &'a SourceText,
     /// What it says of the node.
     pub entry: &'a NodeEntry,
+    /// Its bus; `None` where there is no such bus, which was told.
+    pub bus: Option<BusDef>,
     /// Its TPDOs, by their numbers.
     pub tpdos: Vec<Tpdo<'a>>,
     /// All tags, unrolled.

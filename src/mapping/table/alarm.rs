@@ -76,6 +76,8 @@ pub enum BuiltIn {
     HighLoad,
     /// B07: an NMT command from somebody else.
     ForeignMaster,
+    /// SYNC or TIME from somebody else, where the gateway sends it too.
+    ForeignProducer,
     /// N01: guarding or heartbeat lost the node.
     NodeLost,
     /// N01, first time: no frame at all since the start (R-DET-001).

@@ -13,7 +13,7 @@ use std::ops::Range;
 use std::time::Duration;
 
 use crate::can::BusIndex;
-use crate::canopen::{NodeSettings, Role};
+use crate::canopen::{NodeSettings, Role, SyncSettings, TimeSettings};
 use crate::process_image::{NodeIndex, TagIndex};
 
 pub use alarm::*;
@@ -80,6 +80,10 @@ pub struct BusDef {
     pub bit_rate: u32,
     /// Start nodes by one broadcast (R-DET-018).
     pub start_broadcast: bool,
+    /// SYNC, where the configuration tells of it.
+    pub sync: Option<SyncSettings>,
+    /// TIME, where the gateway sends it.
+    pub time: Option<TimeSettings>,
 }
 
 /// A node.
