@@ -53,4 +53,5 @@ mod properties;
 mod requirements;
 mod support;
 mod transmitter;
+mod units;
 mod web_server;

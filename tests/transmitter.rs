@@ -156,7 +156,7 @@ fn mistakes_about_objects_are_told_with_the_way_out() {
             "",
             "no TPDO maps 0x3000:0, so `pressure_overflow_count` would never have a value",
         ),
-        ("value = 0x004E0000", "value = -1", "dst.toml:45"),
+        ("value = 0x004E0000", "value = -1", "-1 does not fit into u32"),
         (
             "event_timer_ms = 1000",
             "event_timer_ms = 1000\ninhibit_time_us = 50",

@@ -18,6 +18,8 @@ pub struct Poll {
     pub period: Duration,
     /// How many bytes it has, 1..=8.
     pub length: usize,
+    /// The boot has read it: there is nothing new in it before one period has passed.
+    pub read_by_boot: bool,
 }
 
 /// The polls of one node: one at a time, in turn, and none while the node is not ready.
@@ -41,9 +43,11 @@ impl Polls {
         id.0 & POLL_ID != 0
     }
 
-    /// The node is ready: all are read at once, then each in its own time.
+    /// The node is ready: all that are not known yet are read at once, then each in its own time.
     pub(super) fn begin(&mut self, now: Instant) {
-        self.due.fill(Some(now));
+        for (due, poll) in self.due.iter_mut().zip(&self.list) {
+            *due = Some(if poll.read_by_boot { now + poll.period } else { now });
+        }
         self.open = None;
     }
 
@@ -102,6 +106,7 @@ mod tests {
             object: ObjectId::new(0x3000, sub),
             period: Duration::from_secs(seconds),
             length: 2,
+            read_by_boot: false,
         };
         let mut polls = Polls::new(vec![poll(1, 60), poll(2, 10)]);
         assert_eq!(polls.poll_timeout(), None);

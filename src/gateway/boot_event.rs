@@ -3,9 +3,12 @@
 use super::Gateway;
 use super::node::BootTrouble;
 use super::tags::CarrierIndex;
+use super::units::{Finding, What};
 use crate::canopen::PdoIndex;
 use crate::canopen::boot::{BootEvent, BootFailure, MappedPdo};
+use crate::canopen::object::ObjectId;
 use crate::canopen::sdo::SdoError;
+use crate::mapping::DEVICE_UNIT;
 use crate::process_image::{NodeIndex, Quality, Reason};
 use crate::time::Now;
 
@@ -13,8 +16,9 @@ impl Gateway {
     /// Takes an event of the boot of a node.
     pub(super) fn boot_event(&mut self, at: (Now, NodeIndex), told: &BootEvent) {
         match told {
-            // Values that nothing is made of yet are for the journal of the network, not of the plant.
-            BootEvent::Object { .. } | BootEvent::Wrote { .. } => {}
+            BootEvent::Object { object, data } => self.learn(at, *object, data.as_deref()),
+            // What was written is counted, and told of when all is done.
+            BootEvent::Wrote { .. } => {}
             BootEvent::Refused { object, error } => self.tell(at, "setting_refused", |event| {
                 event.text = format!("{object}: {error}");
             }),
@@ -40,14 +44,40 @@ impl Gateway {
         }
     }
 
-    /// The device is asked anew what its TPDOs carry: until it has said so, nothing in them is believed (R-DST-034).
+    /// The device is asked anew what its TPDOs carry and in which units: until it has said so, nothing in them is believed
+    /// (R-DST-034).
     fn withhold(&mut self, index: NodeIndex) {
+        self.tags.units().forget(index);
         let (Some(def), Some(node)) = (self.table.nodes.get(index.0), self.nodes.get_mut(index.0)) else {
             return;
         };
         for (place, watch) in node.watches.iter_mut().enumerate() {
             watch.withheld = def.canopen.boot.asks_about(PdoIndex(place));
         }
+    }
+
+    /// The device said what is in an object: a unit, perhaps.
+    fn learn(&mut self, at: (Now, NodeIndex), object: ObjectId, data: Option<&[u8]>) {
+        for Finding { tag, what } in self.tags.units().learn(at.1, object, data) {
+            let Some(def) = self.table.tag(tag) else { continue };
+            let (tag, wanted) = (def.name.clone(), def.unit.clone());
+            match what {
+                What::UnitChanged { from, to } => self.tell(at, "unit_changed", |event| {
+                    event.text = format!("the device now gives `{tag}` in {to} instead of {from}");
+                    (event.from, event.to) = (from, to);
+                }),
+                What::DigitsChanged { from, to } => self.tell(at, "digits_changed", |event| {
+                    event.text =
+                        format!("the device now gives `{tag}` with {to} decimal digit(s) instead of {from}");
+                    (event.from, event.to) = (from.to_string(), to.to_string());
+                }),
+                What::Unreadable { reason, unit } => self.tell(at, reason.word(), |event| {
+                    event.text = unreadable(&tag, reason, &unit, &wanted);
+                    event.to = unit;
+                }),
+            }
+        }
+        self.dirty_nodes.mark(at.1.0);
     }
 
     /// A TPDO that the device maps otherwise than the mapping file carries nobody knows what: its tags are withheld.
@@ -84,9 +114,13 @@ impl Gateway {
         let carrier = CarrierIndex(def.canopen.pdos.len() + poll);
         // Of fewer bytes than its type has, no value can be made.
         let length = def.canopen.polls.get(poll).map_or(0, |poll| poll.length);
+        let object = def.canopen.polls.get(poll).map(|poll| poll.object);
         if let Some(data) = result.as_ref().ok().filter(|data| data.len() >= length) {
             let quality = node.quality_of_new_data(false);
             self.tags.apply(&self.table, now, (index, carrier), data, quality);
+            if let Some(object) = object {
+                self.learn(at, object, Some(data));
+            }
         } else {
             self.count(index, |counters| &mut counters.sdo_errors);
             let quality = Quality::Bad(Reason::ReadFailed);
@@ -109,4 +143,19 @@ impl Gateway {
         });
         self.tell(at, "node_boot_failed", |event| event.text = failure.to_string());
     }
+}
+
+/// Why no value, or only a raw number, is made of what a device sends.
+fn unreadable(tag: &str, reason: Reason, unit: &str, wanted: &str) -> String {
+    let what = match reason {
+        Reason::UnknownDigits => "the device does not tell how many decimal digits it has".to_owned(),
+        Reason::OtherUnit => format!("the device gives it in {unit}, of which no {wanted} can be made"),
+        _ => format!("the device gives it in a unit that is not known: {unit}"),
+    };
+    let consequence = if wanted == DEVICE_UNIT && reason != Reason::UnknownDigits {
+        "the raw number is shown"
+    } else {
+        "it is bad"
+    };
+    format!("`{tag}`: {what}; {consequence}")
 }

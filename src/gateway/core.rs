@@ -136,6 +136,7 @@ impl Gateway {
         let table = &self.table;
         let mut image = ProcessImage::new(0, 0, 0, table.alarms.len());
         image.tags = self.tags.shown(table);
+        image.units = self.tags.units_shown();
         image.nodes = self.nodes.iter().map(|node| node.status.clone()).collect();
         image.buses = self.buses.iter().map(|bus| bus.status).collect();
         image
@@ -215,6 +216,7 @@ impl Gateway {
     pub fn publish(&mut self, image: &mut ProcessImage) {
         let revision = Revision(image.revision.0 + 1);
         let mut moved = self.tags.publish(&self.table, image, revision);
+        moved |= self.tags.units().publish(image);
         for place in self.dirty_nodes.drain() {
             let (Some(node), Some(shown)) = (self.nodes.get(place), image.nodes.get_mut(place)) else {
                 continue;

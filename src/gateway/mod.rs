@@ -7,7 +7,7 @@
 //! - `core`: the four verbs.
 //! - `bus`: one bus; `node` and `node_event`: one node.
 //! - `supply`: what nodes are sent in RPDOs.
-//! - `tags`: the value of every tag; `derived`: computed tags.
+//! - `tags`: the value of every tag; `derived`: computed tags; `units`: units that devices tell.
 //! - `conditions`: what raises alarms. `events`: on the way to the journal.
 //! - `marks`: which places changed.
 //! - [`replay`]: a recording through the same core.
@@ -30,6 +30,7 @@ pub mod replay;
 mod supply;
 mod tags;
 pub mod task;
+mod units;
 
 pub use command::{Action, Command, CommandSource, Outcome};
 pub use core::{Gateway, Health, Input, Output};

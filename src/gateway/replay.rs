@@ -10,7 +10,7 @@ use super::{Gateway, Input};
 use crate::can::{BusEvent, BusIndex, CanFrame, Link};
 use crate::canopen::Role;
 use crate::mapping::TagTable;
-use crate::process_image::{Event, NodeIndex, ProcessImage, TagIndex, Value};
+use crate::process_image::{Event, NodeIndex, ProcessImage, Sample, TagIndex, Value};
 use crate::time::{Instant, Now, Timestamp};
 
 /// Replays frames of one bus.
@@ -117,7 +117,8 @@ impl Core {
         let time = format!("{}.{:06}", micros / 1_000_000, micros % 1_000_000);
         for (place, sample) in self.image.tags.iter().enumerate() {
             if sample.revision == self.image.revision {
-                lines.push_back(tag_line(table, &time, TagIndex(place), sample.value, &sample.quality));
+                let told = self.image.units.get(&TagIndex(place));
+                lines.push_back(tag_line(table, &time, TagIndex(place), told, sample));
             }
         }
         for (place, (node, online)) in self.image.nodes.iter().zip(&mut self.online).enumerate() {
@@ -137,15 +138,16 @@ impl Core {
     }
 }
 
-fn tag_line(table: &TagTable, time: &str, tag: TagIndex, value: Value, quality: &impl ToString) -> String {
+fn tag_line(table: &TagTable, time: &str, tag: TagIndex, told: Option<&String>, sample: &Sample) -> String {
     let Some(def) = table.tag(tag) else { return String::new() };
     let node = table.node(def.node).map_or("", |node| node.name.as_str());
-    let value = match value {
+    let value = match sample.value {
         Value::Float(number) => format!("{number:.*}", usize::from(def.decimals)),
-        Value::Bool(_) | Value::Unsigned(_) | Value::Signed(_) => value.to_string(),
+        value @ (Value::Bool(_) | Value::Unsigned(_) | Value::Signed(_)) => value.to_string(),
     };
-    let unit = if def.unit.is_empty() { String::new() } else { format!(" {}", def.unit) };
-    format!("{time} {node}.{} = {value}{unit} {}", def.name, quality.to_string())
+    let unit = told.unwrap_or(&def.unit);
+    let unit = if unit.is_empty() { String::new() } else { format!(" {unit}") };
+    format!("{time} {node}.{} = {value}{unit} {}", def.name, sample.quality)
 }
 
 fn event_line(time: &str, event: &Event) -> String {

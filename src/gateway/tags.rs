@@ -6,7 +6,7 @@
 //! What carries values from a device is called a carrier here. Where in it each tag stands is taken over from the
 //! table at the start, so that nothing that is done with received data looks at the source of a tag.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::canopen::PdoIndex;
 use crate::mapping::{Derived, Field, FieldKind, NodeDef, Scale, Source, TagTable, codec};
@@ -15,12 +15,14 @@ use crate::time::{Instant, Now};
 
 use super::derived::{self, Memory};
 use super::marks::Marks;
+use super::units::Units;
 
 /// All tags.
 #[derive(Debug)]
 pub(super) struct Tags {
     layout: Layout,
     state: State,
+    units: Units,
 }
 
 /// What depends on what.
@@ -64,6 +66,8 @@ struct Placed {
     field: Field,
     /// From raw to engineering units; `None` where the raw value is the value.
     scale: Option<Scale>,
+    /// The place of its unit among [`Units`], where the device is asked for it: that goes before `scale`.
+    unit: Option<usize>,
 }
 
 #[derive(Debug)]
@@ -87,7 +91,8 @@ struct State {
 impl Tags {
     /// All tags as they are before anything was received.
     pub(super) fn new(table: &TagTable, now: Now) -> Self {
-        let layout = Layout::new(table);
+        let units = Units::new(table);
+        let layout = Layout::new(table, &units);
         let size = table.tags.len();
         let mut state = State {
             samples: table.tags.iter().map(|tag| never_received(&tag.source)).collect(),
@@ -108,7 +113,17 @@ impl Tags {
         for node in &layout.nodes {
             state.compute_outdated(table, &layout, &node.derived, now);
         }
-        Self { layout, state }
+        Self { layout, state, units }
+    }
+
+    /// The units of tags that are shown in the device's own, as far as they are known.
+    pub(super) fn units_shown(&self) -> BTreeMap<TagIndex, String> {
+        self.units.shown()
+    }
+
+    /// The units of the tags.
+    pub(super) fn units(&mut self) -> &mut Units {
+        &mut self.units
     }
 
     /// The current samples, by tag.
@@ -116,7 +131,8 @@ impl Tags {
         &self.state.samples
     }
 
-    /// Takes new data of a carrier: its tags, and all that is computed from them.
+    /// Takes new data of a carrier: its tags, and all that is computed from them. A tag of which the unit is not known
+    /// stays as it is (R-DST-034).
     pub(super) fn apply(
         &mut self,
         table: &TagTable,
@@ -125,13 +141,18 @@ impl Tags {
         data: &[u8],
         quality: Quality,
     ) {
-        let Self { layout, state } = self;
+        let Self { layout, state, units } = self;
         let node = layout.nodes.get(node.0);
         let Some(carrier) = node.and_then(|node| node.carriers.get(carrier.0)) else { return };
-        for Placed { tag, field, scale } in &carrier.placed {
+        for Placed { tag, field, scale, unit } in &carrier.placed {
+            let (scale, best) = match unit.map(|unit| units.reading(unit)) {
+                None => (*scale, Quality::Good),
+                Some(Some((scale, best))) => (Some(scale), best),
+                Some(None) => continue,
+            };
             let Some(raw) = codec::decode(field, data) else { continue };
-            let value = scale.as_ref().map_or(raw, |scale| codec::scale(scale, raw));
-            state.store(layout, *tag, raw, value, quality_of(value, quality));
+            let value = scale.map_or(raw, |scale| codec::scale(&scale, raw));
+            state.store(layout, *tag, raw, value, quality_of(value, quality.worst(best)));
             state.receive(*tag, now);
         }
         for tag in &carrier.computed {
@@ -150,7 +171,7 @@ impl Tags {
         carrier: Option<CarrierIndex>,
         quality: Quality,
     ) {
-        let Self { layout, state } = self;
+        let Self { layout, state, .. } = self;
         let Some(node) = layout.nodes.get(node.0) else { return };
         let carriers = node.carriers.iter().enumerate();
         let of = carriers.filter(|(place, _)| carrier.is_none_or(|carrier| carrier.0 == *place));
@@ -172,7 +193,7 @@ impl Tags {
 
     /// Opens the latches of a node, or of all nodes, whose source is not set.
     pub(super) fn acknowledge_latches(&mut self, table: &TagTable, now: Now, node: Option<NodeIndex>) {
-        let Self { layout, state } = self;
+        let Self { layout, state, .. } = self;
         let nodes = layout.nodes.iter().enumerate();
         for (_, node) in nodes.filter(|(place, _)| node.is_none_or(|node| node.0 == *place)) {
             for tag in &node.derived {
@@ -190,7 +211,7 @@ impl Tags {
         if self.state.next_second.is_none_or(|due| due > now.instant) {
             return;
         }
-        let Self { layout, state } = self;
+        let Self { layout, state, .. } = self;
         state.next_second = None;
         for tag in state.running.drain() {
             if let Some(outdated) = state.outdated.get_mut(tag) {
@@ -244,7 +265,7 @@ impl Tags {
 }
 
 impl Layout {
-    fn new(table: &TagTable) -> Self {
+    fn new(table: &TagTable, units: &Units) -> Self {
         let mut dependents: Vec<Vec<TagIndex>> = vec![Vec::new(); table.tags.len()];
         for (place, tag) in table.tags.iter().enumerate() {
             if let Source::Derived(derived) = &tag.source {
@@ -255,13 +276,14 @@ impl Layout {
                 });
             }
         }
-        let nodes = table.nodes.iter().map(|node| NodeLayout::new(table, node, &dependents)).collect();
+        let nodes = table.nodes.iter().map(|node| NodeLayout::new(table, node, &dependents, units));
+        let nodes = nodes.collect();
         Self { nodes, dependents }
     }
 }
 
 impl NodeLayout {
-    fn new(table: &TagTable, node: &NodeDef, dependents: &[Vec<TagIndex>]) -> Self {
+    fn new(table: &TagTable, node: &NodeDef, dependents: &[Vec<TagIndex>], units: &Units) -> Self {
         let mut carriers = Vec::new();
         let pdos = node.canopen.pdos.len();
         carriers.resize_with(pdos + node.canopen.polls.len(), CarrierLayout::default);
@@ -279,7 +301,7 @@ impl NodeLayout {
             if let Some((carrier, field, scale)) = placed {
                 let scale = (*scale != Scale::IDENTITY).then_some(*scale);
                 if let Some(carrier) = carriers.get_mut(carrier) {
-                    carrier.placed.push(Placed { tag, field: *field, scale });
+                    carrier.placed.push(Placed { tag, field: *field, scale, unit: units.place_of(tag) });
                 }
             }
         }

@@ -12,6 +12,7 @@
 //! - [`eds`]: mappings made from EDS and DCF files.
 //! - [`expression`]: conditions on tags; [`expression_parser`] reads them.
 //! - [`objection`]: why a value should not be used as it stands.
+//! - [`unit`]: physical units that devices tell, and the way from one to another.
 //! - [`codec`]: raw bits to values, values to registers.
 //! - [`fingerprint`]: which mapping fits a node that was only overheard.
 //! - [`diagnostic`]: messages about files. [`reader`]: strict TOML; [`At`]: a value and its place; [`suggest`]: "did you mean".
@@ -34,6 +35,7 @@ pub mod suggest;
 pub mod table;
 #[cfg(test)]
 pub mod testing;
+pub mod unit;
 
 pub use at::At;
 pub use build::{Installation, Sketch, build, check_mapping, is_name, sort_problems};
@@ -43,8 +45,9 @@ pub use objection::Objection;
 pub use reader::{is_mapping, locate};
 pub use shipped::shipped;
 pub use table::{
-    AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, BusDef, Derived, DeviceDef, Encoding, Field, FieldKind,
-    NodeDef, OnLoss, PublishDef, RegisterDef, Scale, Source, Space, TagDef, TagTable,
+    AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, BusDef, DEVICE_UNIT, Derived, DeviceDef, DeviceUnit,
+    Encoding, Field, FieldKind, NodeDef, OnLoss, PublishDef, Reading, RegisterDef, Scale, Source, Space,
+    TagDef, TagTable, Told,
 };
 
 /// JSON Schema of a device mapping, for editors.

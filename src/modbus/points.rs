@@ -9,7 +9,7 @@ use super::gateway_block::{self, BUS_BLOCK, GATEWAY_BLOCK};
 use super::node_block::{self, NODE_BLOCK, Row};
 use super::register_map::alarm_groups;
 use super::source::source_text;
-use crate::mapping::{Encoding, NodeDef, RegisterDef, Space, TagDef, TagTable};
+use crate::mapping::{DEVICE_UNIT, Encoding, NodeDef, RegisterDef, Space, TagDef, TagTable};
 use crate::process_image::{AlarmIndex, TagIndex};
 
 /// The map of an installation as `map --format json` prints it.
@@ -183,6 +183,8 @@ fn tag_point(
         source: source_text(table, node, &def.source),
         description: if raw {
             format!("{} (as on the bus)", def.description)
+        } else if def.unit == DEVICE_UNIT && def.device_unit.is_some() {
+            format!("{} (in the device's unit)", def.description)
         } else {
             def.description.clone()
         },

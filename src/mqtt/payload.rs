@@ -70,7 +70,19 @@ pub fn state(out: &mut String, table: &TagTable, image: &ProcessImage, node: Nod
             }
         }
     });
+    units(&mut json, table, image, node);
     json.finish();
+}
+
+/// `units`: those of published tags that are shown in the device's own; no member where a node has no such tag.
+fn units(json: &mut JsonWriter<'_>, table: &TagTable, image: &ProcessImage, node: NodeIndex) {
+    let own = || {
+        let of_node = image.units.iter().filter_map(|(tag, unit)| Some((table.tag(*tag)?, unit)));
+        of_node.filter(|(tag, _)| tag.node == node && tag.published)
+    };
+    if own().next().is_some() {
+        json.nested("units", |units| own().for_each(|(tag, unit)| units.text(&tag.name, unit)));
+    }
 }
 
 /// Why a value should not be used as it stands; `None` for a good one.

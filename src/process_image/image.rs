@@ -1,5 +1,7 @@
 //! The process image: the last value of every tag and the state of every node, bus and alarm.
 
+use std::collections::BTreeMap;
+
 use super::{AlarmIndex, AlarmStatus, BusStatus, Journal, NodeIndex, NodeStatus, Quality, Sample, TagIndex};
 use crate::time::Instant;
 
@@ -17,6 +19,8 @@ pub struct ProcessImage {
     pub revision: Revision,
     /// By [`TagIndex`].
     pub tags: Vec<Sample>,
+    /// Units that devices told, of the tags that are shown in the device's own unit.
+    pub units: BTreeMap<TagIndex, String>,
     /// By [`NodeIndex`].
     pub nodes: Vec<NodeStatus>,
     /// By place in the configuration.
@@ -40,6 +44,7 @@ impl ProcessImage {
         Self {
             revision: Revision::default(),
             tags: vec![Sample::NEVER; tags],
+            units: BTreeMap::new(),
             nodes: vec![NodeStatus::default(); nodes],
             buses: vec![BusStatus::default(); buses],
             alarms: vec![AlarmStatus::default(); alarms],

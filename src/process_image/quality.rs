@@ -40,6 +40,12 @@ pub enum Reason {
     ReadFailed,
     /// The device maps its PDO otherwise than the mapping file.
     MappingDiffers,
+    /// The device tells a unit that is not known here (R-DST-036).
+    UnknownUnit,
+    /// The device measures something else than what the value is to be converted to.
+    OtherUnit,
+    /// The device does not tell how many decimal digits its whole numbers have.
+    UnknownDigits,
 }
 
 impl Quality {
@@ -101,6 +107,9 @@ impl Reason {
             Self::NotANumber => "not_a_number",
             Self::ReadFailed => "read_failed",
             Self::MappingDiffers => "mapping_differs",
+            Self::UnknownUnit => "unknown_unit",
+            Self::OtherUnit => "other_unit",
+            Self::UnknownDigits => "unknown_digits",
         }
     }
 }

@@ -1,5 +1,7 @@
 //! The JSON of `/api/v1`, pure: copied out of the process image under its lock, written as text outside it.
 
+use std::borrow::Cow;
+
 use serde::Serialize;
 
 use super::health::{ProgramHealth, SessionHealth};
@@ -201,7 +203,10 @@ fn tags<'a>(table: &'a TagTable, image: &ProcessImage, def: &NodeDef, now: Insta
             description: &tag.description,
             kind: kind(&tag.source),
             value: sample.shown(def.zero_on_bad).map(|value| Json(value, tag.decimals)),
-            unit: &tag.unit,
+            unit: image
+                .units
+                .get(&index)
+                .map_or(Cow::Borrowed(tag.unit.as_str()), |unit| Cow::Owned(unit.clone())),
             decimals: tag.decimals,
             quality: sample.quality.word(),
             reason: tag.objection(image, sample).map(Objection::word),
@@ -232,7 +237,7 @@ pub struct TagView<'a> {
     #[serde(rename = "type")]
     kind: &'static str,
     value: Option<Json>,
-    unit: &'a str,
+    unit: Cow<'a, str>,
     decimals: u8,
     quality: &'static str,
     /// Why it should not be used as it stands; the words are those of MQTT.

@@ -134,7 +134,12 @@ impl Plant {
             error_control: ErrorControl::Heartbeat { timeout: Duration::from_millis(1500) },
             sdo: Some(SdoSettings::default()),
             boot: BootSettings { steps, ..BootSettings::default() },
-            polls: vec![Poll { object: object(0x6131, 1), period: Duration::from_secs(1), length: 4 }],
+            polls: vec![Poll {
+                object: object(0x6131, 1),
+                period: Duration::from_secs(1),
+                length: 4,
+                read_by_boot: false,
+            }],
             pdos: vec![PdoSettings {
                 number: 1,
                 cob_id: CanId::Standard(0x181),

@@ -5,9 +5,9 @@ use std::time::Duration;
 use super::super::file::{MappingWord, SetupSection, SetupValue};
 use super::super::{At, SourceText};
 use super::items::Entry;
-use super::node;
 use super::problems::Problems;
 use super::tags::Context;
+use super::{node, units};
 use crate::canopen::PdoIndex;
 use crate::canopen::boot::{BootStep, MappingMode, PdoSetup};
 use crate::canopen::object::{DataType, ObjectId};
@@ -16,8 +16,11 @@ use crate::canopen::polls::Poll;
 /// Producer heartbeat time.
 const HEARTBEAT: ObjectId = ObjectId::new(0x1017, 0);
 
-/// The steps of the boot: identity, heartbeat, settings, and the PDOs last, so that what they carry is read when all else
-/// is as it should be.
+/// A unit that somebody changes in a running device is noticed within this time.
+const UNIT_PERIOD: Duration = Duration::from_secs(10);
+
+/// The steps of the boot: identity, heartbeat, settings, units, and the PDOs last, so that what they carry is read when all
+/// else is as it should be.
 pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
     let mut steps = identity(problems, context);
     if let Some(at) = &context.file.error_control.heartbeat_ms {
@@ -27,6 +30,7 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
     }
     let setups = context.file.setup.iter().filter_map(|section| setup(problems, context, section));
     steps.extend(setups);
+    steps.extend(units::objects(context).into_iter().map(|(object, _)| BootStep::Read { object }));
     for (place, tpdo) in context.tpdos.iter().enumerate() {
         let section = tpdo.section;
         let mode = match section.mapping {
@@ -84,11 +88,7 @@ fn setup(problems: &mut Problems, context: &Context<'_>, section: &SetupSection)
         problems.error(source, &section.kind.span, message, "use u8 to u64, i8 to i64, f32 or f64");
         return None;
     };
-    let text = match section.value.value {
-        SetupValue::Whole(number) => number.to_string(),
-        SetupValue::Real(number) => number.to_string(),
-    };
-    match kind.encode(&text) {
+    match kind.encode(&value_text(section)) {
         Ok(data) => Some(BootStep::Write { object, data, optional: section.optional }),
         Err(error) => {
             problems.error(source, &section.value.span, error.to_string(), "check `type` and `value`");
@@ -97,7 +97,23 @@ fn setup(problems: &mut Problems, context: &Context<'_>, section: &SetupSection)
     }
 }
 
-/// The objects that tags name and that no TPDO maps, in the order of the file.
+fn value_text(section: &SetupSection) -> String {
+    match section.value.value {
+        SetupValue::Whole(number) => number.to_string(),
+        SetupValue::Real(number) => number.to_string(),
+    }
+}
+
+/// What an object is set to, where that is a number of 32 bits at most.
+pub fn set_to(context: &Context<'_>, object: ObjectId) -> Option<u32> {
+    let section = context.file.setup.iter().find(|section| section.object.value.parse() == Ok(object))?;
+    let data = section.kind.value.parse::<DataType>().ok()?.encode(&value_text(section)).ok()?;
+    let mut bytes = [0; 4];
+    bytes.get_mut(..data.len())?.copy_from_slice(&data);
+    Some(u32::from_le_bytes(bytes))
+}
+
+/// The objects that tags name and that no TPDO maps, in the order of the file; then those in which the device tells units.
 pub fn polls(problems: &mut Problems, context: &Context<'_>) -> Vec<Poll> {
     let mut polls = Vec::new();
     for item in &context.items.list {
@@ -106,7 +122,13 @@ pub fn polls(problems: &mut Problems, context: &Context<'_>) -> Vec<Poll> {
         let millis = problems.within(context.source, at, "poll_ms", 100..=86_400_000);
         let bits = super::fields::whole(section).map_or(8, |field| field.width);
         let length = usize::from(bits.div_ceil(8));
-        polls.push(Poll { object, period: Duration::from_millis(millis), length });
+        polls.push(Poll { object, period: Duration::from_millis(millis), length, read_by_boot: false });
     }
+    polls.extend(units::objects(context).into_iter().map(|(object, length)| Poll {
+        object,
+        period: UNIT_PERIOD,
+        length,
+        read_by_boot: true,
+    }));
     polls
 }

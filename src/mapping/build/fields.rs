@@ -16,7 +16,7 @@ use crate::canopen::object::ObjectId;
 const NO_TPDO: usize = usize::MAX;
 
 /// The kind and width that a type's word stands for.
-fn parse(word: &str) -> Option<(FieldKind, u8)> {
+pub fn parse(word: &str) -> Option<(FieldKind, u8)> {
     let number = |text: &str, lowest: u8| {
         let plain =
             text.len() <= 2 && !text.starts_with('0') && text.bytes().all(|byte| byte.is_ascii_digit());
@@ -38,10 +38,15 @@ fn parse(word: &str) -> Option<(FieldKind, u8)> {
 pub fn kind(section: &TagSection) -> Kind {
     match parse(&section.kind.value) {
         Some((FieldKind::Bool, _)) => Kind::Bool,
-        Some((FieldKind::Unsigned, width)) if section.scale.is_none() => Kind::Bits(width),
+        Some((FieldKind::Unsigned, width)) if is_plain(section) => Kind::Bits(width),
         Some((FieldKind::Unsigned | FieldKind::Signed, width)) => Kind::Whole(width),
         Some((FieldKind::Float, _)) | None => Kind::Number,
     }
+}
+
+/// Whether the raw number is the value.
+fn is_plain(section: &TagSection) -> bool {
+    section.scale.is_none() && section.unit_object.is_none() && section.digits_object.is_none()
 }
 
 /// The TPDO and the bits of a tag.

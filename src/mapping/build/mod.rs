@@ -1,7 +1,7 @@
 //! From the mapping files and the installation's tables to the tag table, or to everything that is wrong with them.
 //!
 //! - this file: what an installation is, and the way through its buses and nodes.
-//! - `items`: the tags of a mapping, arrays unrolled. `tags`, `fields`, `derived`: what they become.
+//! - `items`: the tags of a mapping, arrays unrolled. `tags`, `fields`, `derived`: what they become; `units`: those of the device.
 //! - `node`: what the CANopen master needs to know; `boot`: what it does before it starts the node.
 //! - `alarms`: alarms, their order and what suppresses them.
 //! - `broadcasts`: SYNC and TIME of a bus; `sync`: PDOs that go with SYNC.
@@ -25,6 +25,7 @@ mod sync;
 mod tags;
 #[cfg(test)]
 mod tests;
+mod units;
 
 use std::collections::BTreeMap;
 use std::time::Duration;

@@ -14,7 +14,7 @@ use super::items::{Element, Entry, Item, Items};
 use super::node::Tpdo;
 use super::order::causes_first;
 use super::problems::{Problems, matched};
-use super::{derived, fields};
+use super::{derived, fields, units};
 use crate::process_image::{NodeIndex, TagIndex};
 
 /// Lowest register address of device data; below are those of the node itself.
@@ -171,6 +171,7 @@ fn parameter(
         name: item.name.clone(),
         description: section.description.clone(),
         unit,
+        device_unit: None,
         decimals: 0,
         source: Source::Derived(Derived::Constant { value: value.value }),
         valid: None,
@@ -192,13 +193,15 @@ fn from_pdo(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, sec
         }
     }
     let poll = fields::poll(context, item).zip(fields::whole(section));
-    let scaled = scale != Scale::IDENTITY || field.kind == FieldKind::Float;
+    let device_unit = units::device_unit(problems, context, item, section);
+    let scaled = scale != Scale::IDENTITY || field.kind == FieldKind::Float || device_unit.is_some();
     let usual_decimals = if scaled { 2 } else { 0 };
     let source = match poll {
         Some((poll, field)) => Source::Polled { poll, field, scale },
         None => Source::Pdo { pdo, field, scale },
     };
-    finished(problems, context, item, section.shared(), usual_decimals, source)
+    let tag = finished(problems, context, item, section.shared(), usual_decimals, source);
+    TagDef { device_unit, ..tag }
 }
 
 fn scale(problems: &mut Problems, context: &Context<'_>, section: Option<&At<ScaleSection>>) -> Scale {
@@ -261,6 +264,7 @@ fn finished(
         name: item.name.clone(),
         description,
         unit: item.element.fill(keys.unit),
+        device_unit: None,
         decimals: decimals.and_then(|decimals| u8::try_from(decimals).ok()).unwrap_or(usual_decimals),
         source,
         valid: keys.valid.and_then(|valid| context.bool_tag(problems, valid, &item.element, "`valid`")),

@@ -111,6 +111,11 @@ tag_entry! {
         pub invert: bool,
         /// From the raw number to engineering units. Default: as it is.
         pub scale: Option<At<ScaleSection>>,
+        /// The object in which the device tells the unit, `"0xINDEX:SUB"`. Values are converted to `unit`; that is
+        /// `"device"` where they are to stay in the device's own.
+        pub unit_object: Option<At<String>>,
+        /// The object in which the device tells how many decimal digits its whole numbers have, instead of `scale`.
+        pub digits_object: Option<At<String>>,
     }
     /// Digits after the decimal point, 0..=12. Default: 2 where it is scaled or a float, else 0.
     decimals

@@ -3,10 +3,12 @@
 //! Made once from the mapping files and the installation's nodes; the gateway, the register map and the topics are
 //! all built from it, so that they cannot disagree.
 //!
-//! - `tag`: tags and their places in the register map. `derived`: computed tags. `alarm`: alarms.
+//! - `tag`: tags and their places in the register map. `device_unit`: units that the device tells.
+//! - `derived`: computed tags. `alarm`: alarms.
 
 mod alarm;
 mod derived;
+mod device_unit;
 mod tag;
 
 use std::ops::Range;
@@ -18,6 +20,7 @@ use crate::process_image::{NodeIndex, TagIndex};
 
 pub use alarm::*;
 pub use derived::*;
+pub use device_unit::*;
 pub use tag::*;
 
 /// Everything that an installation has.

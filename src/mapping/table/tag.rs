@@ -1,7 +1,10 @@
 //! Tags, and their places in the register map.
 
-use super::Derived;
+use super::{Derived, DeviceUnit};
 use crate::process_image::{NodeIndex, TagIndex};
+
+/// The word in the place of a unit that only the device knows.
+pub const DEVICE_UNIT: &str = "device";
 
 /// A tag.
 #[derive(Clone, Debug, PartialEq)]
@@ -12,8 +15,10 @@ pub struct TagDef {
     pub name: String,
     /// One sentence.
     pub description: String,
-    /// Engineering unit; empty for none.
+    /// Engineering unit; empty for none, [`DEVICE_UNIT`] for that of the device.
     pub unit: String,
+    /// Unit and decimal digits that the device tells, where it is asked for them.
+    pub device_unit: Option<DeviceUnit>,
     /// Digits after the decimal point in payloads and pages.
     pub decimals: u8,
     /// Where its value comes from.
@@ -95,6 +100,16 @@ pub struct Scale {
 impl Scale {
     /// Raw is the value.
     pub const IDENTITY: Self = Self { multiply: 1.0, divide: 1.0, add: 0.0 };
+
+    /// This one, and another one of what it gives.
+    #[must_use]
+    pub fn then(self, next: Self) -> Self {
+        Self {
+            multiply: self.multiply * next.multiply,
+            divide: self.divide * next.divide,
+            add: self.add * next.multiply / next.divide + next.add,
+        }
+    }
 }
 
 /// A place in the register map.
