@@ -81,6 +81,8 @@ fn any_network() -> impl Strategy<Value = NetworkSettings> {
         |(passive, start_broadcast, first, second, auto_start)| NetworkSettings {
             role: if passive { Role::Passive } else { Role::Master },
             start_broadcast,
+            sync: None,
+            time: None,
             nodes: vec![
                 NodeSettings { error_control: first, ..detcon(1) },
                 NodeSettings {
