@@ -122,7 +122,7 @@ mod tests {
             (100_000, 0x0022_0000, 0, 1.0),
             (12345, BAR, 3, 12.345),
             (50_000, 0xFD4E_0000, 1, 5.0),
-            (123_456, 0x00AB_0000, 2, 85.119_915_638_460_8),
+            (123_456, 0x00AB_0000, 2, 85.119_915_636_460_8),
         ] {
             let reading = in_bar.reading(Scale::IDENTITY, Some(code), Some(digits));
             assert!((value(&reading, Value::Signed(raw)) - expected).abs() < 1e-9, "{raw} 0x{code:08X}");
