@@ -37,6 +37,7 @@
     reason = "a test may fail loudly; helpers in `support` are not used by every test"
 )]
 
+mod adopt;
 mod architecture;
 mod contract;
 mod contract_mqtt;

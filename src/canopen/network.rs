@@ -8,8 +8,8 @@ use super::node::{Node, SdoRefused};
 use super::outputs::Outputs;
 use super::sdo::{SdoRequest, TransferId};
 use super::{
-    ErrorControl, ForeignEvent, NetworkOutput, NetworkSettings, NmtRequest, NodeEvent, NodeId, PdoIndex, Role,
-    RpdoIndex, cob_id,
+    ErrorControl, ForeignEvent, NetworkOutput, NetworkSettings, NmtRequest, NodeEvent, NodeId, PdoIndex,
+    Role, RpdoIndex, cob_id,
 };
 use crate::can::{CanFrame, CanId};
 use crate::time::{Instant, Now};

@@ -1,5 +1,7 @@
 //! Reception of the TPDOs of one node: length rules (R-DET-080, R-DET-081) and timeout (R-DET-082).
 
+use std::time::Duration;
+
 use super::{PdoIndex, PdoSettings};
 use crate::time::Instant;
 
@@ -16,6 +18,8 @@ struct Pdo {
     settings: PdoSettings,
     /// When it is late; `None` where it is not supervised, and after it was reported until the next frame.
     deadline: Option<Instant>,
+    /// Its length is not known: the node is being asked what it carries.
+    asked: bool,
 }
 
 /// What a frame's length makes of it.
@@ -32,7 +36,8 @@ pub(super) enum Length {
 impl Pdos {
     /// Not supervised yet.
     pub(super) fn new(settings: Vec<PdoSettings>) -> Self {
-        let pdos = settings.into_iter().map(|settings| Pdo { settings, deadline: None }).collect();
+        let pdos =
+            settings.into_iter().map(|settings| Pdo { settings, deadline: None, asked: false }).collect();
         Self { pdos, supervised: false }
     }
 
@@ -40,6 +45,22 @@ impl Pdos {
     pub(super) fn set_length(&mut self, index: PdoIndex, length: u8) {
         if let Some(pdo) = self.pdos.get_mut(index.0) {
             pdo.settings.length = length;
+            pdo.asked = false;
+        }
+    }
+
+    /// The node is asked what some TPDOs carry: until it has said so, every length is right.
+    pub(super) fn forget_lengths(&mut self, asked: impl Fn(PdoIndex) -> bool) {
+        for (place, pdo) in self.pdos.iter_mut().enumerate() {
+            pdo.asked = asked(PdoIndex(place));
+        }
+    }
+
+    /// The node sends by another event timer than was thought; what is awaited already is awaited as before.
+    pub(super) fn set_timeout(&mut self, index: PdoIndex, timeout: Option<Duration>) {
+        if let Some(pdo) = self.pdos.get_mut(index.0) {
+            pdo.settings.timeout = timeout;
+            pdo.deadline = pdo.deadline.filter(|_| timeout.is_some());
         }
     }
 
@@ -52,6 +73,7 @@ impl Pdos {
     pub(super) fn receive(&mut self, now: Instant, index: PdoIndex, dlc: u8) -> Option<Length> {
         let pdo = self.pdos.get_mut(index.0)?;
         let length = match dlc.cmp(&pdo.settings.length) {
+            _ if pdo.asked => Length::Right,
             std::cmp::Ordering::Less => Length::Discarded,
             std::cmp::Ordering::Greater if pdo.settings.strict_length => Length::Discarded,
             std::cmp::Ordering::Greater => Length::TooLong,
@@ -97,8 +119,6 @@ impl Pdos {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use super::*;
     use crate::can::CanId;
 

@@ -30,12 +30,14 @@ pub(super) struct Polls {
     due: Vec<Option<Instant>>,
     /// The one under way.
     open: Option<usize>,
+    /// Objects that a TPDO carries after all: they are not read.
+    carried: Vec<ObjectId>,
 }
 
 impl Polls {
     /// Nothing is read before [`begin`](Self::begin).
     pub(super) fn new(polls: Vec<Poll>) -> Self {
-        Self { due: vec![None; polls.len()], list: polls, open: None }
+        Self { due: vec![None; polls.len()], list: polls, open: None, carried: Vec::new() }
     }
 
     /// Whether a transfer was asked for by a poll.
@@ -46,9 +48,20 @@ impl Polls {
     /// The node is ready: all that are not known yet are read at once, then each in its own time.
     pub(super) fn begin(&mut self, now: Instant) {
         for (due, poll) in self.due.iter_mut().zip(&self.list) {
-            *due = Some(if poll.read_by_boot { now + poll.period } else { now });
+            let first = if poll.read_by_boot { now + poll.period } else { now };
+            *due = Some(first).filter(|_| !self.carried.contains(&poll.object));
         }
         self.open = None;
+    }
+
+    /// The node is asked anew what it sends by itself.
+    pub(super) fn forget_carried(&mut self) {
+        self.carried.clear();
+    }
+
+    /// The node sends these objects by itself.
+    pub(super) fn carry(&mut self, objects: impl Iterator<Item = ObjectId>) {
+        self.carried.extend(objects);
     }
 
     /// The node is not ready any more.

@@ -1,16 +1,21 @@
 //! What the boot of a node tells: to the journal, to its status, to its alarms.
 
+use std::sync::Arc;
+
 use super::Gateway;
 use super::node::BootTrouble;
 use super::tags::CarrierIndex;
 use super::units::{Finding, What};
-use crate::canopen::PdoIndex;
 use crate::canopen::boot::{BootEvent, BootFailure, MappedPdo};
 use crate::canopen::object::ObjectId;
 use crate::canopen::sdo::SdoError;
+use crate::canopen::{PdoIndex, Role, cob_id};
 use crate::mapping::DEVICE_UNIT;
 use crate::process_image::{NodeIndex, Quality, Reason};
 use crate::time::Now;
+
+/// The identifier of emergency messages.
+const EMERGENCY_ID: ObjectId = ObjectId::new(0x1014, 0);
 
 impl Gateway {
     /// Takes an event of the boot of a node.
@@ -32,6 +37,7 @@ impl Gateway {
             BootEvent::Mapped(mapped) => self.mapped(at, mapped),
             BootEvent::RpdoMapped(mapped) => self.rpdo_mapped(at, mapped),
             BootEvent::Done { written } => {
+                self.tell_of_missing(at);
                 self.change(at.1, |node| {
                     node.boot_trouble = None;
                     node.status.identity_mismatch = false;
@@ -58,6 +64,9 @@ impl Gateway {
 
     /// The device said what is in an object: a unit, perhaps.
     fn learn(&mut self, at: (Now, NodeIndex), object: ObjectId, data: Option<&[u8]>) {
+        if object == EMERGENCY_ID {
+            self.tell_of_emergency_id(at, data);
+        }
         for Finding { tag, what } in self.tags.units().learn(at.1, object, data) {
             let Some(def) = self.table.tag(tag) else { continue };
             let (tag, wanted) = (def.name.clone(), def.unit.clone());
@@ -83,12 +92,22 @@ impl Gateway {
     /// A TPDO that the device maps otherwise than the mapping file carries nobody knows what: its tags are withheld.
     fn mapped(&mut self, at: (Now, NodeIndex), mapped: &MappedPdo) {
         let (now, index) = at;
-        let wanted = self.table.nodes.get(index.0).and_then(|def| def.canopen.boot.setup_of(mapped.pdo));
-        let differs = wanted.is_some_and(|wanted| wanted.maps != mapped.maps);
+        let boot = self.table.nodes.get(index.0).map(|def| &def.canopen.boot);
+        let adopts = boot.and_then(|boot| boot.adopts(mapped.pdo));
+        let wanted = boot.and_then(|boot| boot.setup_of(mapped.pdo));
+        let differs = adopts.is_none() && wanted.is_some_and(|wanted| wanted.maps != mapped.maps);
         let watch = self.nodes.get_mut(index.0).and_then(|node| node.watches.get_mut(mapped.pdo.0));
         if let Some(watch) = watch {
             watch.withheld = differs;
+            watch.length = mapped.length();
+            if adopts == Some(true) {
+                watch.timeout = mapped.timeout();
+            }
         }
+        if adopts.is_some() {
+            self.adopted(at, mapped);
+        }
+        self.tell_of_identifier(at, mapped);
         if differs {
             self.degrade(now, index, Some(mapped.pdo), Quality::Bad(Reason::MappingDiffers));
             let number = self.pdo_number(index, mapped.pdo);
@@ -102,6 +121,85 @@ impl Gateway {
             self.tell(at, "pdo_switched_off", |event| {
                 event.text = format!("TPDO{number} is switched off in the device (bit 31 of its COB-ID)");
             });
+        }
+    }
+
+    /// Emergency messages with another identifier than that of CiA 301 are told of (R-DST-119).
+    fn tell_of_emergency_id(&mut self, at: (Now, NodeIndex), data: Option<&[u8]>) {
+        let Some(def) = self.table.nodes.get(at.1.0) else { return };
+        let expected = cob_id::emcy(def.canopen.id);
+        let Some(found) = data.and_then(|data| <[u8; 4]>::try_from(data).ok()).map(u32::from_le_bytes) else {
+            return;
+        };
+        if expected.raw() != found {
+            self.tell(at, "emergency_id_differs", |event| {
+                event.text = format!(
+                    "the device has 0x{found:X} in {EMERGENCY_ID} for its emergency messages, not {expected}: they are not \
+                     heard"
+                );
+            });
+        }
+    }
+
+    /// A TPDO is taken as the device has it (R-DST-024).
+    fn adopted(&mut self, at: (Now, NodeIndex), mapped: &MappedPdo) {
+        let maps = if mapped.cob_id.is_some() { mapped.maps.as_slice() } else { &[] };
+        self.tags.adopt(at.1, mapped.pdo, maps);
+        let number = self.pdo_number(at.1, mapped.pdo);
+        let supervised = self
+            .nodes
+            .get(at.1.0)
+            .and_then(|node| node.watches.get(mapped.pdo.0))
+            .is_some_and(|watch| watch.timeout.is_some());
+        let maps = maps.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+        self.tell(at, "pdo_adopted", |event| {
+            let warning = if supervised { "" } else { "; nothing says how often, so it is not supervised" };
+            event.text = format!("the device sends in TPDO{number}: {maps}{warning}");
+        });
+    }
+
+    /// An identifier that is not the one of the mapping file is used all the same, and told (R-DST-119).
+    fn tell_of_identifier(&mut self, at: (Now, NodeIndex), mapped: &MappedPdo) {
+        let settings = self.table.nodes.get(at.1.0).and_then(|def| def.canopen.pdos.get(mapped.pdo.0));
+        let expected = settings.map(|pdo| pdo.cob_id);
+        if let (Some(found), Some(expected)) = (mapped.cob_id, expected)
+            && found != expected
+        {
+            let number = self.pdo_number(at.1, mapped.pdo);
+            self.tell(at, "pdo_id_differs", |event| {
+                event.text =
+                    format!("the device sends TPDO{number} as {found}, not as {expected}; that is used");
+                (event.from, event.to) = (expected.to_string(), found.to_string());
+            });
+        }
+    }
+
+    /// Where a device may not be asked, what its mapping file says of TPDOs that would be adopted is believed.
+    pub(super) fn believe_mappings(&mut self, now: Now) {
+        let table = Arc::clone(&self.table);
+        for (place, def) in table.nodes.iter().enumerate() {
+            let index = NodeIndex(place);
+            let passive = table.buses.get(def.bus.0).is_none_or(|bus| bus.role == Role::Passive);
+            for pdo in (0..def.canopen.pdos.len()).map(PdoIndex).filter(|_| passive) {
+                if let (Some(_), Some(setup)) = (def.canopen.boot.adopts(pdo), def.canopen.boot.setup_of(pdo))
+                {
+                    self.tags.adopt(index, pdo, &setup.maps);
+                }
+            }
+            if passive {
+                self.tags.finish_adoption(&table, now, index);
+            }
+        }
+    }
+
+    /// What none of the TPDOs of a device carries and nobody reads has no value.
+    fn tell_of_missing(&mut self, at: (Now, NodeIndex)) {
+        let missing = self.tags.finish_adoption(&self.table, at.0, at.1);
+        let names: Vec<&str> =
+            missing.iter().filter_map(|tag| self.table.tag(*tag)).map(|tag| tag.name.as_str()).collect();
+        if !names.is_empty() {
+            let text = format!("no TPDO of the device carries: {}", names.join(", "));
+            self.tell(at, "not_mapped", |event| event.text = text);
         }
     }
 

@@ -439,7 +439,14 @@ impl Gateway {
     }
 
     /// SYNC or TIME of somebody else: of a second producer, or of one that the configuration does not know.
-    fn foreign_broadcast(&mut self, now: Now, index: BusIndex, what: &'static str, produced: bool, first: bool) {
+    fn foreign_broadcast(
+        &mut self,
+        now: Now,
+        index: BusIndex,
+        what: &'static str,
+        produced: bool,
+        first: bool,
+    ) {
         self.count_foreign_frame(index);
         if produced {
             self.conditions.pulse(now, AlarmOwner::Bus(index), BuiltIn::ForeignProducer);

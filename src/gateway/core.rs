@@ -108,6 +108,7 @@ impl Gateway {
             nodes,
             table,
         };
+        gateway.believe_mappings(now);
         for (place, node) in gateway.nodes.iter_mut().enumerate() {
             node.status.data_good = gateway.tags.all_good(NodeIndex(place));
         }

@@ -2,6 +2,8 @@
 //!
 //! What each event of its network does to it is in `node_event`.
 
+use std::time::Duration;
+
 use super::Gateway;
 use crate::canopen::{ErrorControl, NmtState, PdoIndex};
 use crate::mapping::{AlarmOwner, BuiltIn, NodeDef};
@@ -54,6 +56,10 @@ pub(super) struct PdoWatch {
     pub(super) fresh_until: Option<Instant>,
     /// Its alarm is not raised before: when it did not come, the cause could still have been another.
     pub(super) held_until: Option<Instant>,
+    /// It has to come within this time; `None`: it is not supervised.
+    pub(super) timeout: Option<Duration>,
+    /// Bytes that it has.
+    pub(super) length: u8,
     /// What it carries is not known: the device was not asked yet, or maps it otherwise than the mapping file (R-DST-034).
     pub(super) withheld: bool,
     /// Set reserved bits of the last frame.
@@ -109,8 +115,15 @@ impl Node {
             missing_since: None,
             recovered_at: None,
             fell_silent: false,
-            watches: (0..pdos.len())
-                .map(|pdo| PdoWatch { withheld: asked(pdo), ..PdoWatch::default() })
+            watches: pdos
+                .iter()
+                .enumerate()
+                .map(|(place, pdo)| PdoWatch {
+                    withheld: asked(place),
+                    timeout: pdo.timeout,
+                    length: pdo.length,
+                    ..PdoWatch::default()
+                })
                 .collect(),
         }
     }
@@ -151,7 +164,7 @@ impl Node {
 
     /// Whether frames are to be expected of it all the time.
     pub(super) fn is_expected(&self, def: &NodeDef) -> bool {
-        let sends_pdos = def.canopen.pdos.iter().any(|pdo| pdo.timeout.is_some());
+        let sends_pdos = self.watches.iter().any(|pdo| pdo.timeout.is_some());
         let may_send = matches!(self.nmt, None | Some(NmtState::Operational));
         is_watched(def) || (sends_pdos && may_send)
     }
@@ -334,7 +347,7 @@ impl Gateway {
             return;
         };
         let mut supervised =
-            def.canopen.pdos.iter().zip(&node.status.pdos).filter(|(settings, _)| settings.timeout.is_some());
+            node.watches.iter().zip(&node.status.pdos).filter(|(watch, _)| watch.timeout.is_some());
         if !is_watched(def) && supervised.all(|(_, status)| !status.usable) {
             node.fell_silent = true;
             self.refresh_node(now, index);

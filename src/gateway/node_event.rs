@@ -133,8 +133,7 @@ impl Gateway {
         let number = status.number;
         status.usable = true;
         node.status.newest_data = Some(now.utc);
-        let timeout = def.canopen.pdos.get(pdo.0).and_then(|pdo| pdo.timeout);
-        watch.fresh_until = timeout.map(|timeout| now.instant + timeout);
+        watch.fresh_until = watch.timeout.map(|timeout| now.instant + timeout);
         watch.held_until = None;
         let fresh_until = watch.fresh_until;
 
@@ -166,12 +165,14 @@ impl Gateway {
 
     fn pdo_length(&mut self, at: (Now, NodeIndex), pdo: PdoIndex, received: u8, discarded: bool) {
         let (now, index) = at;
-        let settings = self.table.nodes.get(index.0).and_then(|def| def.canopen.pdos.get(pdo.0));
-        let Some((number, expected)) = settings.map(|pdo| (pdo.number, pdo.length)) else { return };
+        let number = self.pdo_number(index, pdo);
         self.count(index, |counters| &mut counters.pdo_length_errors);
+        let Some(watch) = self.nodes.get_mut(index.0).and_then(|node| node.watches.get_mut(pdo.0)) else {
+            return;
+        };
+        let expected = watch.length;
         let too_long = received > expected;
-        let watch = self.nodes.get_mut(index.0).and_then(|node| node.watches.get_mut(pdo.0));
-        let told = too_long && watch.is_some_and(|watch| std::mem::replace(&mut watch.told_too_long, true));
+        let told = too_long && std::mem::replace(&mut watch.told_too_long, true);
         // One whose first bytes are used needs somebody to look at it once; data that is discarded is missing.
         if discarded || !told {
             self.conditions.pulse(now, AlarmOwner::Node(index), BuiltIn::PdoLength);

@@ -17,6 +17,9 @@ use super::derived::{self, Memory};
 use super::marks::Marks;
 use super::units::Units;
 
+mod adopted;
+use adopted::Adopted;
+
 /// All tags.
 #[derive(Debug)]
 pub(super) struct Tags {
@@ -49,6 +52,8 @@ struct NodeLayout {
     carriers: Vec<CarrierLayout>,
     /// In the order of the table: inputs come before what is computed from them.
     derived: Vec<TagIndex>,
+    /// Tags that stand where the device says.
+    adopted: Vec<Adopted>,
 }
 
 #[derive(Debug, Default)]
@@ -60,7 +65,7 @@ struct CarrierLayout {
 }
 
 /// A tag and its place in a carrier.
-#[derive(Debug)]
+#[derive(Clone, Copy, Debug)]
 struct Placed {
     tag: TagIndex,
     field: Field,
@@ -183,10 +188,14 @@ impl Tags {
         state.compute_outdated(table, layout, &node.derived, now);
     }
 
-    /// Whether all that a node's device sends is good: each tag that stands in one of its carriers.
+    /// Whether all that a node's device sends is good: each tag that stands in one of its carriers, or should.
     pub(super) fn all_good(&self, node: NodeIndex) -> bool {
         let carriers = self.layout.nodes.get(node.0).map(|node| node.carriers.as_slice()).unwrap_or_default();
-        let mut placed = carriers.iter().flat_map(|carrier| &carrier.placed);
+        let adopted = self.layout.nodes.get(node.0).map(|node| node.adopted.as_slice()).unwrap_or_default();
+        let mut placed = carriers
+            .iter()
+            .flat_map(|carrier| &carrier.placed)
+            .chain(adopted.iter().map(|adopted| &adopted.placed));
         placed
             .all(|placed| self.state.samples.get(placed.tag.0).is_some_and(|sample| sample.quality.is_good()))
     }
@@ -287,11 +296,18 @@ impl NodeLayout {
         let mut carriers = Vec::new();
         let pdos = node.canopen.pdos.len();
         carriers.resize_with(pdos + node.canopen.polls.len(), CarrierLayout::default);
-        let mut derived = Vec::new();
+        let (mut derived, mut adopted) = (Vec::new(), Vec::new());
         for tag in node.tags.clone().map(TagIndex) {
             let placed = match table.tag(tag).map(|tag| &tag.source) {
                 Some(Source::Pdo { pdo, field, scale }) => Some((*pdo, field, scale)),
                 Some(Source::Polled { poll, field, scale }) => Some((pdos + poll, field, scale)),
+                Some(Source::Adopted { object, poll, field, scale }) => {
+                    let scale = (*scale != Scale::IDENTITY).then_some(*scale);
+                    let placed = Placed { tag, field: *field, scale, unit: units.place_of(tag) };
+                    let poll = poll.map(|poll| CarrierIndex(pdos + poll));
+                    adopted.push(Adopted { object: *object, poll, placed });
+                    None
+                }
                 Some(Source::Derived(_)) => {
                     derived.push(tag);
                     None
@@ -305,10 +321,9 @@ impl NodeLayout {
                 }
             }
         }
-        for carrier in &mut carriers {
-            carrier.computed = computed_from(carrier.placed.iter().map(|placed| placed.tag), dependents);
-        }
-        Self { carriers, derived }
+        let mut layout = Self { carriers, derived, adopted };
+        layout.place_polled(dependents);
+        layout
     }
 }
 
@@ -438,7 +453,9 @@ fn same(left: &Sample, right: &Sample) -> bool {
 /// A sample of the right kind in which nothing was received.
 fn never_received(source: &Source) -> Sample {
     let (raw, scale) = match source {
-        Source::Pdo { field, scale, .. } | Source::Polled { field, scale, .. } => {
+        Source::Pdo { field, scale, .. }
+        | Source::Polled { field, scale, .. }
+        | Source::Adopted { field, scale, .. } => {
             let raw = match field.kind {
                 FieldKind::Bool => Value::Bool(false),
                 FieldKind::Unsigned => Value::Unsigned(0),

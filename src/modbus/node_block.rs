@@ -306,7 +306,7 @@ impl<'a> NodeView<'a> {
         let tags = self.table.tags.get(self.def.tags.clone()).unwrap_or_default();
         tags.iter().zip(self.def.tags.clone()).filter_map(|(tag, index)| match tag.source {
             Source::Pdo { pdo, .. } => Some((pdo, self.image.tag(TagIndex(index)).quality)),
-            Source::Derived(_) | Source::Polled { .. } => None,
+            Source::Derived(_) | Source::Polled { .. } | Source::Adopted { .. } => None,
         })
     }
 

@@ -15,6 +15,7 @@ pub fn source_text(table: &TagTable, node: &NodeDef, source: &Source) -> String 
             let object = node.canopen.polls.get(*poll).map(|poll| poll.object);
             object.map_or_else(String::new, |object| format!("SDO {object}"))
         }
+        Source::Adopted { object, .. } => format!("{object}, where the device maps it"),
         Source::Derived(derived) => derived_text(table, derived),
     }
 }

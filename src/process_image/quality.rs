@@ -40,6 +40,8 @@ pub enum Reason {
     ReadFailed,
     /// The device maps its PDO otherwise than the mapping file.
     MappingDiffers,
+    /// No TPDO of the device carries it.
+    NotMapped,
     /// The device tells a unit that is not known here (R-DST-036).
     UnknownUnit,
     /// The device measures something else than what the value is to be converted to.
@@ -107,6 +109,7 @@ impl Reason {
             Self::NotANumber => "not_a_number",
             Self::ReadFailed => "read_failed",
             Self::MappingDiffers => "mapping_differs",
+            Self::NotMapped => "not_mapped",
             Self::UnknownUnit => "unknown_unit",
             Self::OtherUnit => "other_unit",
             Self::UnknownDigits => "unknown_digits",

@@ -220,7 +220,9 @@ fn tags<'a>(table: &'a TagTable, image: &ProcessImage, def: &NodeDef, now: Insta
 /// Whether a source gives bits or numbers.
 fn kind(source: &Source) -> &'static str {
     let bit = match source {
-        Source::Pdo { field, .. } | Source::Polled { field, .. } => field.kind == FieldKind::Bool,
+        Source::Pdo { field, .. } | Source::Polled { field, .. } | Source::Adopted { field, .. } => {
+            field.kind == FieldKind::Bool
+        }
         Source::Derived(derived) => {
             matches!(derived, Derived::Bit { .. } | Derived::Logic { .. } | Derived::Latch { .. })
         }

@@ -1,5 +1,7 @@
 //! What the boot of a node tells.
 
+use std::time::Duration;
+
 use crate::can::CanId;
 use crate::canopen::PdoIndex;
 use crate::canopen::object::{MappedObject, ObjectId};
@@ -68,6 +70,13 @@ impl MappedPdo {
     pub fn length(&self) -> u8 {
         let bits: u32 = self.maps.iter().map(|object| u32::from(object.bits)).sum();
         u8::try_from(bits.div_ceil(8)).unwrap_or(8).min(8)
+    }
+
+    /// Within which time it has to come: three event timers (R-DST-050). `None`: its event timer does not run.
+    #[must_use]
+    pub fn timeout(&self) -> Option<Duration> {
+        let timed = self.transmission_type >= 254 && self.event_timer > 0;
+        timed.then(|| 3 * Duration::from_millis(self.event_timer.into()))
     }
 }
 

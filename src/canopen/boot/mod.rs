@@ -24,9 +24,9 @@ pub use event::{BootEvent, BootFailure, MappedPdo};
 pub use settings::{BootSettings, BootStep, MappingMode, PdoSetup};
 
 use self::task::{Advance, Task};
-use super::RpdoIndex;
 use super::object::MappedObject;
 use super::sdo::{SdoError, SdoRequest, TransferId};
+use super::{PdoIndex, RpdoIndex};
 use crate::time::Instant;
 
 /// After a boot-up message the node is left in peace for a moment: some take requests before they can answer them.
@@ -124,6 +124,16 @@ impl Boot {
     /// What an RPDO is to carry, where the node is asked.
     pub(super) fn wants_rpdo(&self, rpdo: RpdoIndex) -> Option<&[MappedObject]> {
         self.settings.setup_of_rpdo(rpdo).map(|setup| setup.maps.as_slice())
+    }
+
+    /// Whether a TPDO is taken as the node has it; then whether its time-out follows from the node's event timer.
+    pub(super) fn adopts(&self, pdo: PdoIndex) -> Option<bool> {
+        self.settings.adopts(pdo)
+    }
+
+    /// Whether the node is asked what a TPDO carries.
+    pub(super) fn asks_about(&self, pdo: PdoIndex) -> bool {
+        self.settings.asks_about(pdo)
     }
 
     /// Whether there is nothing to do at all.

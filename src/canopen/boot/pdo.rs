@@ -175,7 +175,7 @@ impl PdoTask {
     /// Everything is read.
     fn compare(&mut self, operational: bool) -> Advance {
         self.writes = self.differences();
-        if self.writes.is_empty() || self.setup.mode == MappingMode::Adopt {
+        if self.writes.is_empty() || matches!(self.setup.mode, MappingMode::Adopt { .. }) {
             return self.tell();
         }
         if self.setup.mode == MappingMode::Verify {

@@ -45,6 +45,15 @@ impl BootSettings {
         })
     }
 
+    /// Whether a TPDO is taken as the node has it; then whether its time-out follows from the node's event timer.
+    #[must_use]
+    pub fn adopts(&self, pdo: PdoIndex) -> Option<bool> {
+        match self.setup_of(pdo)?.mode {
+            MappingMode::Adopt { timed } => Some(timed),
+            MappingMode::Write | MappingMode::Verify => None,
+        }
+    }
+
     /// Whether the node is asked what a TPDO carries.
     #[must_use]
     pub fn asks_about(&self, pdo: PdoIndex) -> bool {
@@ -119,6 +128,9 @@ pub enum MappingMode {
     Write,
     /// It is told, and decoded as the node has it.
     Verify,
-    /// It is decoded as the node has it, without a word.
-    Adopt,
+    /// Nothing is written: it is decoded as the node has it.
+    Adopt {
+        /// It has to come within three times its event timer, where the node has that running.
+        timed: bool,
+    },
 }

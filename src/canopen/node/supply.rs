@@ -41,7 +41,12 @@ impl Node {
     }
 
     /// A frame of ours did not leave.
-    pub(in crate::canopen) fn rpdo_not_sent(&mut self, now: Instant, frame: &CanFrame, outputs: &mut Outputs) {
+    pub(in crate::canopen) fn rpdo_not_sent(
+        &mut self,
+        now: Instant,
+        frame: &CanFrame,
+        outputs: &mut Outputs,
+    ) {
         if let Some(rpdo) = self.rpdos.handle_not_sent(now, frame) {
             outputs.node(self.id, NodeEvent::RpdoNotSent { rpdo });
         }

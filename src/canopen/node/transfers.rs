@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::super::boot::{Boot, BootEvent, BootOutput};
+use super::super::boot::{Boot, BootEvent, BootOutput, MappedPdo};
 use super::super::outputs::Outputs;
 use super::super::polls::Polls;
 use super::super::sdo::{SdoClient, SdoError, SdoOutput, SdoRequest, TransferId};
@@ -96,9 +96,11 @@ impl Node {
             }
             BootOutput::EnterPreOperational => self.enter_pre_operational(now, outputs),
             BootOutput::Tell(event) => {
-                if let BootEvent::Mapped(mapped) = &event {
-                    self.pdos.set_length(mapped.pdo, mapped.length());
-                    self.moved.push((mapped.pdo, mapped.cob_id));
+                if event == BootEvent::Begun {
+                    self.pdos.forget_lengths(|pdo| self.boot.asks_about(pdo));
+                    self.polls.forget_carried();
+                } else if let BootEvent::Mapped(mapped) = &event {
+                    self.mapped(mapped);
                 }
                 if let BootEvent::RpdoMapped(mapped) = &event {
                     self.rpdo_mapped(now, RpdoIndex(mapped.pdo.0), mapped.cob_id, &mapped.maps);
@@ -117,6 +119,19 @@ impl Node {
                     start.handle_boot_done(now, self.state == Some(NmtState::Operational), wait);
                 }
             }
+        }
+    }
+
+    /// The node said how it sends a TPDO.
+    fn mapped(&mut self, mapped: &MappedPdo) {
+        self.pdos.set_length(mapped.pdo, mapped.length());
+        self.moved.push((mapped.pdo, mapped.cob_id));
+        if let Some(timed) = self.boot.adopts(mapped.pdo) {
+            if timed {
+                self.pdos.set_timeout(mapped.pdo, mapped.timeout());
+            }
+            let sent = mapped.maps.iter().filter(|_| mapped.cob_id.is_some());
+            self.polls.carry(sent.map(|mapped| mapped.object));
         }
     }
 

@@ -312,7 +312,7 @@ fn r_dst_064_a_boot_up_message_begins_everything_anew() {
 
 #[test]
 fn r_dst_024_verify_tells_and_adopt_takes_what_the_node_has() {
-    for (mode, tells) in [(MappingMode::Verify, true), (MappingMode::Adopt, false)] {
+    for (mode, tells) in [(MappingMode::Verify, true), (MappingMode::Adopt { timed: true }, false)] {
         let mut plant = Plant::new(vec![BootStep::Pdo(setup(mode, false))]);
         plant.link_up();
         assert_eq!(plant.written(), Vec::<String>::new(), "{mode:?}");
@@ -334,7 +334,7 @@ fn r_dst_024_verify_tells_and_adopt_takes_what_the_node_has() {
 
 #[test]
 fn r_dst_119_a_tpdo_on_another_identifier_is_taken_from_there() {
-    let mut plant = Plant::new(vec![BootStep::Pdo(setup(MappingMode::Adopt, false))]);
+    let mut plant = Plant::new(vec![BootStep::Pdo(setup(MappingMode::Adopt { timed: true }, false))]);
     plant.device.objects.insert(object(0x1800, 1), 0x1A5_u32.to_le_bytes().to_vec());
     plant.link_up();
     let node = NodeId::new(1).unwrap();
@@ -344,6 +344,15 @@ fn r_dst_119_a_tpdo_on_another_identifier_is_taken_from_there() {
             .any(|output| matches!(output, NetworkOutput::Node(id, NodeEvent::Pdo { .. }) if id == node))
     };
     assert!(received(&mut plant, "1A5#A086010000"));
+    // Bit 29: it has 29 bits.
+    plant.device.objects.insert(object(0x1800, 1), 0x2001_2345_u32.to_le_bytes().to_vec());
+    plant.frame("701#00");
+    plant.run(1000);
+    assert!(received(&mut plant, "00012345#A086010000"));
+    assert!(!received(&mut plant, "1A5#A086010000"));
+    plant.device.objects.insert(object(0x1800, 1), 0x1A5_u32.to_le_bytes().to_vec());
+    plant.frame("701#00");
+    plant.run(1000);
     assert!(!received(&mut plant, "181#A086010000"));
 }
 

@@ -5,6 +5,7 @@ use std::time::Duration;
 use super::super::file::{MappingWord, SetupSection, SetupValue};
 use super::super::{At, SourceText};
 use super::items::Entry;
+use super::node::Tpdo;
 use super::problems::Problems;
 use super::tags::Context;
 use super::{node, units};
@@ -16,6 +17,8 @@ use crate::canopen::polls::Poll;
 /// Producer heartbeat time.
 const HEARTBEAT: ObjectId = ObjectId::new(0x1017, 0);
 
+/// Identifier of emergency messages.
+const EMERGENCY_ID: ObjectId = ObjectId::new(0x1014, 0);
 /// A unit that somebody changes in a running device is noticed within this time.
 const UNIT_PERIOD: Duration = Duration::from_secs(10);
 
@@ -31,9 +34,14 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
     let setups = context.file.setup.iter().filter_map(|section| setup(problems, context, section));
     steps.extend(setups);
     steps.extend(units::objects(context).into_iter().map(|(object, _)| BootStep::Read { object }));
+    let before_pdos = steps.len();
     for (place, tpdo) in context.tpdos.iter().enumerate() {
         let section = tpdo.section;
         let mode = match section.mapping {
+            MappingWord::Adopt => {
+                refuse_changes(problems, context, tpdo);
+                MappingMode::Adopt { timed: node::is_untimed(context, section) }
+            }
             _ if section.maps.is_empty() => continue,
             MappingWord::Fixed => continue,
             MappingWord::Write => MappingMode::Write,
@@ -45,8 +53,7 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
         let transmission_type = number(tpdo.transmission_type(context), "transmission_type", 255);
         let event_timer = number(tpdo.event_timer(context), "event_timer_ms", 65_535);
         let inhibit_time = number(tpdo.inhibit_time(context), "inhibit_time_us", 6_553_500);
-        if let Some((source, at)) =
-            tpdo.inhibit_time(context).filter(|(_, at)| !at.value.is_multiple_of(100))
+        if let Some((source, at)) = tpdo.inhibit_time(context).filter(|(_, at)| !at.value.is_multiple_of(100))
         {
             let message = format!("inhibit_time_us {} cannot be set", at.value);
             problems.error(source, &at.span, message, "devices count in steps of 100 us");
@@ -62,7 +69,26 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
             set_invalid: section.set_pdo_invalid,
         }));
     }
+    // A device that has identifiers of its own for its TPDOs may have one for its emergency messages too (R-DST-119).
+    if steps.len() > before_pdos {
+        steps.insert(before_pdos, BootStep::Read { object: EMERGENCY_ID });
+    }
     steps
+}
+
+/// What is adopted is not changed.
+fn refuse_changes(problems: &mut Problems, context: &Context<'_>, tpdo: &Tpdo<'_>) {
+    let numbers = [
+        (tpdo.transmission_type(context), "transmission_type"),
+        (tpdo.event_timer(context), "event_timer_ms"),
+        (tpdo.inhibit_time(context), "inhibit_time_us"),
+    ];
+    for (at, key) in numbers {
+        if let Some((source, at)) = at {
+            let message = format!("a TPDO that is adopted is not changed, so `{key}` would never be written");
+            problems.error(source, &at.span, message, "leave it out, or write mapping = \"write\"");
+        }
+    }
 }
 
 fn identity(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {

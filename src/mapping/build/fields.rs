@@ -118,7 +118,14 @@ fn place(
 ) -> Option<(At<u64>, At<u64>)> {
     let source = context.source;
     match (&section.tpdo, &section.bit, &section.object) {
-        (Some(tpdo), Some(bit), None) => Some((tpdo.clone(), bit.clone())),
+        (Some(tpdo), Some(bit), None) => {
+            if context.tpdos.iter().any(|known| known.number == tpdo.value && known.is_adopted()) {
+                let message =
+                    format!("where `{}` stands in TPDO {} is for the device to say", item.name, tpdo.value);
+                problems.error(source, &tpdo.span, message, "name its `object` instead of `tpdo` and `bit`");
+            }
+            Some((tpdo.clone(), bit.clone()))
+        }
         (None, None, Some(object)) => {
             let id = node::object(problems, source, object)?;
             if let Some(array) = &section.array {
@@ -126,9 +133,8 @@ fn place(
                 problems.error(source, &array.span, message, "write an entry for each object");
             }
             check_width(problems, context, section, object, id);
-            let found =
-                context.tpdos.iter().find_map(|tpdo| Some((tpdo.number, node::bit_of(tpdo.section, id)?)));
-            if found.is_none() && section.poll_ms.is_none() {
+            let found = node::in_pdo(context, id);
+            if found.is_none() && section.poll_ms.is_none() && node::adopted(context, section).is_none() {
                 let message = format!("no TPDO maps {id}, so `{}` would never have a value", item.name);
                 problems.error(
                     source,

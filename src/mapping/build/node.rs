@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::super::At;
 use super::super::SourceText;
-use super::super::file::{MappingFile, TagSection, TpdoSection};
+use super::super::file::{MappingFile, MappingWord, TagSection, TpdoSection};
 use super::super::installation::{ErrorControlWord, NodeEntry, TpdoEntry};
 use super::boot;
 use super::problems::Problems;
@@ -29,7 +29,8 @@ pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> N
     let polls = boot::polls(problems, context);
     let pdos = context.tpdos.iter().map(|tpdo| {
         let pdo = pdo(problems, context, id, tpdo);
-        if pdo.timeout.is_none() {
+        // Whether one that is adopted has an event timer is seen when the device is asked.
+        if pdo.timeout.is_none() && !(tpdo.is_adopted() && is_untimed(context, tpdo.section)) {
             warn_of_silence(problems, context, tpdo, error_control == ErrorControl::None);
         }
         pdo
@@ -162,12 +163,7 @@ fn start(problems: &mut Problems, context: &Context<'_>) -> StartSettings {
     }
 }
 
-fn pdo(
-    problems: &mut Problems,
-    context: &Context<'_>,
-    id: NodeId,
-    pdo: &Tpdo<'_>,
-) -> PdoSettings {
+fn pdo(problems: &mut Problems, context: &Context<'_>, id: NodeId, pdo: &Tpdo<'_>) -> PdoSettings {
     let (source, key, tpdo) = (context.source, pdo.key, pdo.section);
     let number = key.value.parse::<u16>().ok().filter(|number| (1..=512).contains(number));
     if number.is_none_or(|number| number.to_string() != key.value) {
@@ -212,6 +208,11 @@ fn pdo(
     }
 }
 
+/// Whether nothing says within which time a TPDO has to come.
+pub fn is_untimed(context: &Context<'_>, tpdo: &TpdoSection) -> bool {
+    context.entry.pdo_timeout_ms.is_none() && tpdo.timeout_ms.is_none() && tpdo.period_ms.is_none()
+}
+
 /// The event timer, where it runs.
 fn event_timer(context: &Context<'_>, tpdo: &Tpdo<'_>) -> Option<Duration> {
     let (_, at) = tpdo.event_timer(context)?;
@@ -234,6 +235,9 @@ fn checked_length(problems: &mut Problems, source: &SourceText, key: &At<String>
     }
     let span = tpdo.maps.first().map(|entry| &entry.span).or(tpdo.length.as_ref().map(|at| &at.span));
     let Some((length, span)) = length(tpdo).zip(span) else {
+        if tpdo.mapping == MappingWord::Adopt {
+            return 8;
+        }
         let hint = "give it `length`, or `maps`";
         problems.error(source, &key.span, format!("the length of TPDO {} is not known", key.value), hint);
         return 8;
@@ -272,11 +276,24 @@ pub fn bit_of(tpdo: &TpdoSection, object: ObjectId) -> Option<u64> {
     None
 }
 
+/// The number of the TPDO that the file has an object in, and its bit there. One that is adopted counts for nothing: the
+/// device has the last word on it.
+pub fn in_pdo(context: &Context<'_>, object: ObjectId) -> Option<(u64, u64)> {
+    let mut known = context.tpdos.iter().filter(|tpdo| !tpdo.is_adopted());
+    known.find_map(|tpdo| Some((tpdo.number, bit_of(tpdo.section, object)?)))
+}
+
 /// The object and period of a tag that no TPDO maps.
 pub fn polled<'a>(context: &Context<'_>, section: &'a TagSection) -> Option<(ObjectId, &'a At<u64>)> {
     let object = section.object.as_ref()?.value.parse().ok()?;
-    let in_pdo = context.tpdos.iter().any(|tpdo| bit_of(tpdo.section, object).is_some());
-    Some((object, section.poll_ms.as_ref()?)).filter(|_| !in_pdo)
+    Some((object, section.poll_ms.as_ref()?)).filter(|_| in_pdo(context, object).is_none())
+}
+
+/// The object of a tag that is looked for in the TPDOs that are adopted.
+pub fn adopted(context: &Context<'_>, section: &TagSection) -> Option<ObjectId> {
+    let object = section.object.as_ref()?.value.parse().ok()?;
+    let adopts = context.tpdos.iter().any(Tpdo::is_adopted);
+    Some(object).filter(|object| adopts && in_pdo(context, *object).is_none())
 }
 
 /// One TPDO of a mapping.
@@ -296,9 +313,7 @@ impl<'a> Tpdo<'a> {
     /// All of a mapping, by their numbers.
     pub fn all(file: &'a MappingFile, entry: &'a NodeEntry) -> Vec<Self> {
         let number = |key: &At<String>| key.value.parse().unwrap_or(u64::MAX);
-        let tpdo = |(key, section)| {
-            Self { number: number(key), key, section, changes: entry.tpdo.get(key) }
-        };
+        let tpdo = |(key, section)| Self { number: number(key), key, section, changes: entry.tpdo.get(key) };
         let mut all: Vec<Self> = file.tpdo.iter().map(tpdo).collect();
         all.sort_by_key(|tpdo| tpdo.number);
         all
@@ -328,6 +343,11 @@ impl<'a> Tpdo<'a> {
         let changed = self.changes.and_then(|changes| changed(changes).as_ref());
         let changed = changed.map(|at| (context.config, at));
         changed.or(own.as_ref().map(|at| (context.source, at)))
+    }
+
+    /// Whether it is taken as the device has it.
+    pub fn is_adopted(&self) -> bool {
+        self.section.mapping == MappingWord::Adopt
     }
 
     /// Whether its number is none.

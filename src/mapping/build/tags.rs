@@ -8,13 +8,15 @@ use super::super::file::{
     TagSection,
 };
 use super::super::installation::{ByteOrderWord, NodeEntry, TagEntry};
-use super::super::table::{BusDef, Derived, Encoding, FieldKind, RegisterDef, Scale, Source, Space, TagDef};
+use super::super::table::{
+    BusDef, Derived, Encoding, Field, FieldKind, RegisterDef, Scale, Source, Space, TagDef,
+};
 use super::super::{At, SourceText};
 use super::items::{Element, Entry, Item, Items};
 use super::node::Tpdo;
 use super::order::causes_first;
 use super::problems::{Problems, matched};
-use super::{derived, fields, units};
+use super::{derived, fields, node, units};
 use crate::process_image::{NodeIndex, TagIndex};
 
 /// Lowest register address of device data; below are those of the node itself.
@@ -196,9 +198,13 @@ fn from_pdo(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, sec
     let device_unit = units::device_unit(problems, context, item, section);
     let scaled = scale != Scale::IDENTITY || field.kind == FieldKind::Float || device_unit.is_some();
     let usual_decimals = if scaled { 2 } else { 0 };
-    let source = match poll {
-        Some((poll, field)) => Source::Polled { poll, field, scale },
-        None => Source::Pdo { pdo, field, scale },
+    let source = match (node::adopted(context, section), poll) {
+        (Some(object), poll) => {
+            let field = Field { bit: 0, ..field };
+            Source::Adopted { object, poll: poll.map(|(poll, _)| poll), field, scale }
+        }
+        (None, Some((poll, field))) => Source::Polled { poll, field, scale },
+        (None, None) => Source::Pdo { pdo, field, scale },
     };
     let tag = finished(problems, context, item, section.shared(), usual_decimals, source);
     TagDef { device_unit, ..tag }

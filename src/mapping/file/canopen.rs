@@ -115,6 +115,8 @@ pub enum MappingWord {
     Verify,
     /// Nothing is read or written: the file is believed.
     Fixed,
+    /// Nothing is written: tags that name an `object` are decoded where the node has it.
+    Adopt,
 }
 
 /// `[[setup]]`: an object that is to have a value.

@@ -1,6 +1,7 @@
 //! Tags, and their places in the register map.
 
 use super::{Derived, DeviceUnit};
+use crate::canopen::object::ObjectId;
 use crate::process_image::{NodeIndex, TagIndex};
 
 /// The word in the place of a unit that only the device knows.
@@ -50,6 +51,17 @@ pub enum Source {
         /// Which, by its place in the polls of the node's settings.
         poll: usize,
         /// How its bytes are read.
+        field: Field,
+        /// From raw to engineering units.
+        scale: Scale,
+    },
+    /// An object that stands where the node itself maps it, or nowhere.
+    Adopted {
+        /// Which.
+        object: ObjectId,
+        /// How it is read where no TPDO carries it, by its place in the polls of the node's settings.
+        poll: Option<usize>,
+        /// How its bits are read, from the first of them on.
         field: Field,
         /// From raw to engineering units.
         scale: Scale,
