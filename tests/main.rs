@@ -8,6 +8,7 @@
 //! | `eds` | EDS and DCF files of any quality become mappings; an import moves nothing that it gave away |
 //! | `mappings` | every shipped mapping checks; every message about a wrong one says what, where and how to mend it |
 //! | `contract` | golden files: register map, topics, payloads. Never edited to pass |
+//! | `outputs` | RPDOs: who may be sent what; what a write needs; SYNC operation of a transmitter |
 //! | `modbus_server` | the Modbus TCP server over loopback sockets |
 //! | `contract_mqtt` | golden files: topics and payloads. Never edited to pass |
 //! | `mqtt_publisher` | what is published when |
@@ -50,6 +51,7 @@ mod mappings;
 mod modbus_server;
 mod mqtt_client;
 mod mqtt_publisher;
+mod outputs;
 mod properties;
 mod requirements;
 mod support;

@@ -213,7 +213,9 @@ fn an_installation_changes_what_it_may() {
     let tag = |name: &str| table.tag(table.find_tag(NodeIndex(0), name).unwrap()).unwrap();
     let field = |name: &str| match tag(name).source {
         Source::Pdo { field, .. } => field,
-        Source::Derived(_) | Source::Polled { .. } | Source::Adopted { .. } => panic!("{name}"),
+        Source::Derived(_) | Source::Polled { .. } | Source::Adopted { .. } | Source::Rpdo { .. } => {
+            panic!("{name}")
+        }
     };
     assert!(field("trip").invert && !field("load_reduction").invert);
     assert!(field("used_sensors_1_16").big_endian && !field("bad_inputs_1_16").big_endian);

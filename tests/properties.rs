@@ -119,7 +119,9 @@ fn nothing_old_is_good(conversation: &Conversation) {
         let node = table.node(def.node).unwrap();
         let bus = image.buses[node.bus.0].state;
         match &def.source {
-            Source::Polled { .. } | Source::Adopted { .. } => unreachable!("a DetCon knows no SDO"),
+            Source::Polled { .. } | Source::Adopted { .. } | Source::Rpdo { .. } => {
+                unreachable!("a DetCon knows no SDO and no RPDO")
+            }
             Source::Pdo { pdo, .. } => {
                 let down = matches!(bus, BusState::Absent | BusState::Down | BusState::BusOff);
                 assert!(!sample.quality.is_good() || !down, "{} is good though its bus is {bus:?}", def.name);

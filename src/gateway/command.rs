@@ -1,7 +1,7 @@
 //! What a northbound can ask for. Checked here, whoever asks; written to the journal, whatever comes of it.
 
 use crate::canopen::NmtRequest;
-use crate::process_image::{AlarmIndex, NodeIndex};
+use crate::process_image::{AlarmIndex, NodeIndex, TagIndex, Value};
 
 /// A request.
 #[derive(Clone, Debug, PartialEq)]
@@ -26,7 +26,7 @@ pub enum CommandSource {
 }
 
 /// What is asked for.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum Action {
     /// An NMT command to one node.
     Nmt {
@@ -34,6 +34,14 @@ pub enum Action {
         node: NodeIndex,
         /// The command.
         request: NmtRequest,
+    },
+    /// A value for a tag that stands in an RPDO. Done means that it was taken: it is in a frame that the bus took, or is
+    /// sent as soon as the inhibit time, SYNC, or the other values of its RPDO allow.
+    WriteTag {
+        /// The tag.
+        tag: TagIndex,
+        /// What it is to be, in engineering units.
+        value: Value,
     },
     /// One alarm was seen by an operator.
     Acknowledge {

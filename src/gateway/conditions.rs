@@ -171,7 +171,13 @@ fn spec(table: &TagTable, alarm: &AlarmDef) -> AlarmSpec {
 fn counted(table: &TagTable, tag: TagIndex) -> &[TagIndex] {
     match table.tag(tag).map(|tag| &tag.source) {
         Some(Source::Derived(Derived::Count { of })) => of,
-        Some(Source::Derived(_) | Source::Pdo { .. } | Source::Polled { .. } | Source::Adopted { .. })
+        Some(
+            Source::Derived(_)
+            | Source::Pdo { .. }
+            | Source::Polled { .. }
+            | Source::Adopted { .. }
+            | Source::Rpdo { .. },
+        )
         | None => &[],
     }
 }

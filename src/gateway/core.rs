@@ -9,6 +9,7 @@ use super::events::{EventLog, Name};
 use super::marks::Marks;
 use super::node::Node;
 use super::operate::Finished;
+use super::supply::Supply;
 use super::tags::{CarrierIndex, Tags};
 use super::{Command, Outcome};
 use crate::can::{BusEvent, BusIndex, CanFrame};
@@ -68,6 +69,7 @@ pub struct Gateway {
     pub(super) buses: Vec<Bus>,
     pub(super) nodes: Vec<Node>,
     pub(super) tags: Tags,
+    pub(super) supply: Supply,
     pub(super) conditions: Conditions,
     pub(super) events: EventLog,
     pub(super) health: Health,
@@ -95,6 +97,7 @@ impl Gateway {
         let mut gateway = Self {
             buses,
             tags: Tags::new(&table, now),
+            supply: Supply::new(&table),
             conditions: Conditions::new(&table),
             events: EventLog::new(Arc::clone(&table)),
             health: Health::default(),
@@ -113,6 +116,7 @@ impl Gateway {
             node.status.data_good = gateway.tags.all_good(NodeIndex(place));
         }
         gateway.events.record(now, AlarmOwner::Gateway, Name::Word("gateway_started"), |_| ());
+        gateway.begin_supply(now);
         for bus in 0..gateway.buses.len() {
             gateway.drain_network(now, BusIndex(bus));
             gateway.refresh_nodes_of(now, BusIndex(bus));
@@ -155,7 +159,7 @@ impl Gateway {
     /// The queue of frames to a bus was full, so that a frame of ours could not even be handed over.
     /// To be told before the next [`poll_output`](Self::poll_output): a command whose frame it was is answered "busy".
     pub fn handle_refused(&mut self, now: Now, bus: BusIndex, frame: &CanFrame) {
-        self.refuse_command(bus, frame);
+        self.refuse_command(now, bus, frame);
         self.bus_refused(now, bus, frame);
         self.settle(now);
     }

@@ -2,6 +2,7 @@
 
 use super::core::{Gateway, Output};
 use super::node_event::request_word;
+use super::supply::Undo;
 use super::{Action, Command, CommandSource, Outcome};
 use crate::alarms::AcknowledgeError;
 use crate::can::{BusIndex, CanFrame};
@@ -24,6 +25,8 @@ pub(super) struct Finished {
     outcome: Outcome,
     /// The frame that does it: if the bus does not even take it, nothing was done.
     frame: Option<(BusIndex, CanFrame)>,
+    /// What is to hold again in that case.
+    undo: Option<Undo>,
 }
 
 impl Gateway {
@@ -31,11 +34,19 @@ impl Gateway {
     /// came of it, follow when its frame was handed over: see [`Gateway::answer_commands`].
     pub(super) fn command(&mut self, now: Now, command: Command) {
         let Command { id, source, action } = command;
-        let mut frame = None;
+        let (mut frame, mut undo) = (None, None);
         let (name, about, outcome, what) = match action {
             Action::Nmt { node, request } => {
                 let outcome = self.request_nmt(now, node, request, &mut frame);
                 ("nmt", self.owner_of_node(node), outcome, request_word(request).to_owned())
+            }
+            Action::WriteTag { tag, value } => {
+                let outcome;
+                (outcome, undo) = self.write_tag(now, tag, value, &mut frame);
+                let def = self.table.tag(tag);
+                let about = def.map_or(AlarmOwner::Gateway, |def| AlarmOwner::Node(def.node));
+                let what = def.map(|def| format!("{} = {value}", def.name)).unwrap_or_default();
+                ("write", about, outcome, what)
             }
             Action::Acknowledge { alarm } => {
                 let outcome = match self.conditions.list_mut().acknowledge(now, alarm) {
@@ -63,16 +74,21 @@ impl Gateway {
                 ("reset", self.owner_of_alarm(alarm), outcome, self.name_of_alarm(alarm))
             }
         };
-        self.finished.push(Finished { id, at: now, source, name, about, what, outcome, frame });
+        self.finished.push(Finished { id, at: now, source, name, about, what, outcome, frame, undo });
         self.settle(now);
     }
 
     /// The bus did not take a frame: the command that it was for failed.
-    pub(super) fn refuse_command(&mut self, bus: BusIndex, frame: &CanFrame) {
+    pub(super) fn refuse_command(&mut self, now: Now, bus: BusIndex, frame: &CanFrame) {
+        let mut undone = Vec::new();
         for command in &mut self.finished {
             if command.frame == Some((bus, *frame)) {
                 command.outcome = Outcome::Busy;
+                undone.extend(command.undo.take());
             }
+        }
+        for undo in undone {
+            self.take_back(now, undo);
         }
     }
 

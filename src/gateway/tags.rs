@@ -8,7 +8,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::canopen::PdoIndex;
+use crate::canopen::{PdoIndex, RpdoIndex};
 use crate::mapping::{Derived, Field, FieldKind, NodeDef, Scale, Source, TagTable, codec};
 use crate::process_image::{NodeIndex, ProcessImage, Quality, Reason, Revision, Sample, TagIndex, Value};
 use crate::time::{Instant, Now};
@@ -36,9 +36,17 @@ struct Layout {
     dependents: Vec<Vec<TagIndex>>,
 }
 
-/// Which carrier of a node: its TPDOs, by their places in its settings; then the objects that are polled, by theirs.
+/// Which carrier of a node: its TPDOs, by their places in its settings; then the objects that are polled, by theirs; then
+/// the RPDOs of its definition.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct CarrierIndex(pub(super) usize);
+
+impl CarrierIndex {
+    /// That of an RPDO.
+    pub(super) fn of_rpdo(node: &NodeDef, rpdo: RpdoIndex) -> Self {
+        Self(node.canopen.pdos.len() + node.canopen.polls.len() + rpdo.0)
+    }
+}
 
 impl From<PdoIndex> for CarrierIndex {
     fn from(pdo: PdoIndex) -> Self {
@@ -50,6 +58,8 @@ impl From<PdoIndex> for CarrierIndex {
 struct NodeLayout {
     /// By [`CarrierIndex`].
     carriers: Vec<CarrierLayout>,
+    /// How many of them come from the node.
+    received: usize,
     /// In the order of the table: inputs come before what is computed from them.
     derived: Vec<TagIndex>,
     /// Tags that stand where the device says.
@@ -191,9 +201,12 @@ impl Tags {
     /// Whether all that a node's device sends is good: each tag that stands in one of its carriers, or should.
     pub(super) fn all_good(&self, node: NodeIndex) -> bool {
         let carriers = self.layout.nodes.get(node.0).map(|node| node.carriers.as_slice()).unwrap_or_default();
-        let adopted = self.layout.nodes.get(node.0).map(|node| node.adopted.as_slice()).unwrap_or_default();
+        let node = self.layout.nodes.get(node.0);
+        let adopted = node.map(|node| node.adopted.as_slice()).unwrap_or_default();
+        let received = node.map_or(0, |node| node.received);
         let mut placed = carriers
             .iter()
+            .take(received)
             .flat_map(|carrier| &carrier.placed)
             .chain(adopted.iter().map(|adopted| &adopted.placed));
         placed
@@ -295,7 +308,8 @@ impl NodeLayout {
     fn new(table: &TagTable, node: &NodeDef, dependents: &[Vec<TagIndex>], units: &Units) -> Self {
         let mut carriers = Vec::new();
         let pdos = node.canopen.pdos.len();
-        carriers.resize_with(pdos + node.canopen.polls.len(), CarrierLayout::default);
+        let received = pdos + node.canopen.polls.len();
+        carriers.resize_with(received + node.rpdos.len(), CarrierLayout::default);
         let (mut derived, mut adopted) = (Vec::new(), Vec::new());
         for tag in node.tags.clone().map(TagIndex) {
             let placed = match table.tag(tag).map(|tag| &tag.source) {
@@ -308,6 +322,7 @@ impl NodeLayout {
                     adopted.push(Adopted { object: *object, poll, placed });
                     None
                 }
+                Some(Source::Rpdo { rpdo, field, scale, .. }) => Some((received + rpdo, field, scale)),
                 Some(Source::Derived(_)) => {
                     derived.push(tag);
                     None
@@ -321,7 +336,7 @@ impl NodeLayout {
                 }
             }
         }
-        let mut layout = Self { carriers, derived, adopted };
+        let mut layout = Self { carriers, received, derived, adopted };
         layout.place_polled(dependents);
         layout
     }
@@ -455,7 +470,8 @@ fn never_received(source: &Source) -> Sample {
     let (raw, scale) = match source {
         Source::Pdo { field, scale, .. }
         | Source::Polled { field, scale, .. }
-        | Source::Adopted { field, scale, .. } => {
+        | Source::Adopted { field, scale, .. }
+        | Source::Rpdo { field, scale, .. } => {
             let raw = match field.kind {
                 FieldKind::Bool => Value::Bool(false),
                 FieldKind::Unsigned => Value::Unsigned(0),
@@ -467,6 +483,8 @@ fn never_received(source: &Source) -> Sample {
         Source::Derived(derived) => (derived::nothing(derived), Scale::IDENTITY),
     };
     let value = codec::scale(&scale, raw);
+    let is_sent = matches!(source, Source::Rpdo { .. });
+    let quality = if is_sent { Quality::Bad(Reason::NotSent) } else { Quality::NEVER };
     // What the offset of a scale makes of a zero was never measured.
-    Sample { raw, value: zero(value), ..Sample::NEVER }
+    Sample { raw, value: zero(value), quality, ..Sample::NEVER }
 }

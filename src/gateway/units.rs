@@ -73,9 +73,10 @@ impl Units {
         let tags = table.tags.iter().enumerate();
         let list = tags.filter_map(|(place, tag)| {
             let scale = match &tag.source {
-                Source::Pdo { scale, .. } | Source::Polled { scale, .. } | Source::Adopted { scale, .. } => {
-                    *scale
-                }
+                Source::Pdo { scale, .. }
+                | Source::Polled { scale, .. }
+                | Source::Adopted { scale, .. }
+                | Source::Rpdo { scale, .. } => *scale,
                 Source::Derived(_) => return None,
             };
             let def = tag.device_unit.clone()?;

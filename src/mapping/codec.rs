@@ -60,6 +60,115 @@ pub fn scale(scale: &Scale, raw: Value) -> Value {
     Value::Float(raw.as_f64() * scale.multiply / scale.divide + scale.add)
 }
 
+/// Why a value cannot be written into a field.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum EncodeError {
+    /// A bit takes true and false, or 1 and 0.
+    #[error("it is a bit: write true or false")]
+    NotABit,
+    /// A number takes no truth.
+    #[error("it is a number: write a number")]
+    NotANumber,
+    /// NaN and infinity are for nobody to act on.
+    #[error("NaN and infinity cannot be written")]
+    NotFinite,
+    /// It does not fit into the bits.
+    #[error("it is out of the range of its type")]
+    OutOfRange,
+    /// The field does not lie in eight bytes.
+    #[error("the field does not lie in the PDO")]
+    NoField,
+}
+
+/// Puts a value, in engineering units, into the bits of a field: [`decode`] and [`scale`] backwards. A number is rounded to
+/// the nearest that the field can hold, halves away from zero. On an error `data` is as it was.
+pub fn encode(field: &Field, scale: &Scale, value: Value, data: &mut [u8; 8]) -> Result<(), EncodeError> {
+    let (bit, width) = (u32::from(field.bit), u32::from(field.width));
+    if width == 0 || bit + width > 64 {
+        return Err(EncodeError::NoField);
+    }
+    let mask = u64::MAX >> (64 - width);
+    let mut bits = match field.kind {
+        FieldKind::Bool => u64::from(truth(value).ok_or(EncodeError::NotABit)?),
+        FieldKind::Unsigned => whole_bits(unscaled_whole(scale, value)?, 0, i128::from(mask))?,
+        FieldKind::Signed => {
+            let highest = i128::from(mask >> 1);
+            whole_bits(unscaled_whole(scale, value)?, -highest - 1, highest)?
+        }
+        FieldKind::Float => float_bits(unscaled(scale, value)?, width)?,
+    } & mask;
+    if field.invert {
+        bits ^= mask;
+    }
+    if field.big_endian {
+        bits = bits.swap_bytes() >> (64 - width);
+    }
+    *data = ((u64::from_le_bytes(*data) & !(mask << bit)) | (bits << bit)).to_le_bytes();
+    Ok(())
+}
+
+fn truth(value: Value) -> Option<bool> {
+    match value {
+        Value::Bool(bit) => Some(bit),
+        Value::Unsigned(_) | Value::Signed(_) | Value::Float(_) if value.as_f64() == 0.0 => Some(false),
+        Value::Unsigned(1) | Value::Signed(1) | Value::Float(1.0) => Some(true),
+        Value::Unsigned(_) | Value::Signed(_) | Value::Float(_) => None,
+    }
+}
+
+/// The raw number of a value.
+fn unscaled(scale: &Scale, value: Value) -> Result<f64, EncodeError> {
+    let number = match value {
+        Value::Bool(_) => return Err(EncodeError::NotANumber),
+        Value::Unsigned(_) | Value::Signed(_) | Value::Float(_) => value.as_f64(),
+    };
+    let raw =
+        if *scale == Scale::IDENTITY { number } else { (number - scale.add) * scale.divide / scale.multiply };
+    match (number.is_finite(), raw.is_finite()) {
+        (false, _) => Err(EncodeError::NotFinite),
+        (true, false) => Err(EncodeError::OutOfRange),
+        (true, true) => Ok(raw),
+    }
+}
+
+/// The same, rounded; without a scale all digits are kept.
+fn unscaled_whole(scale: &Scale, value: Value) -> Result<i128, EncodeError> {
+    match value {
+        Value::Unsigned(number) if *scale == Scale::IDENTITY => Ok(number.into()),
+        Value::Signed(number) if *scale == Scale::IDENTITY => Ok(number.into()),
+        Value::Bool(_) | Value::Unsigned(_) | Value::Signed(_) | Value::Float(_) => {
+            #[expect(
+                clippy::as_conversions,
+                clippy::cast_possible_truncation,
+                reason = "saturates, and whatever is so large is out of every range"
+            )]
+            let whole = unscaled(scale, value)?.round() as i128;
+            Ok(whole)
+        }
+    }
+}
+
+/// The two's complement of a whole number, within limits.
+fn whole_bits(number: i128, lowest: i128, highest: i128) -> Result<u64, EncodeError> {
+    if !(lowest..=highest).contains(&number) {
+        return Err(EncodeError::OutOfRange);
+    }
+    u64::try_from(number & i128::from(u64::MAX)).map_err(|_| EncodeError::OutOfRange)
+}
+
+fn float_bits(number: f64, width: u32) -> Result<u64, EncodeError> {
+    if width != 32 {
+        return Ok(number.to_bits());
+    }
+    #[expect(
+        clippy::as_conversions,
+        clippy::cast_possible_truncation,
+        reason = "the nearest single-precision number"
+    )]
+    let single = number as f32;
+    if single.is_finite() { Ok(single.to_bits().into()) } else { Err(EncodeError::OutOfRange) }
+}
+
 /// A value as registers, high word first; of an encoding that takes one register the first counts, the second is 0.
 ///
 /// `value` is in engineering units, `resolution` is that of the [`RegisterDef`](super::RegisterDef), `raw` is shown by the raw
@@ -211,6 +320,88 @@ mod tests {
             let [high, low] = registers(Encoding::I32, 1.0, Value::Signed(signed.into()), Value::Bool(false), true);
             prop_assert_eq!((u32::from(high) << 16 | u32::from(low)).cast_signed(), signed);
         }
+    }
+
+    /// Fields of every kind, width and place, with what decodes to a value that can be written.
+    fn any_typed_field() -> impl Strategy<Value = Field> {
+        (any_field(), 0..4).prop_map(|(field, kind)| match kind {
+            0 => Field { kind: FieldKind::Signed, ..field },
+            1 => Field { kind: FieldKind::Bool, width: 1, big_endian: false, ..field },
+            2 => {
+                let width = if field.bit == 0 { 64 } else { 32 };
+                Field {
+                    kind: FieldKind::Float,
+                    bit: field.bit.min(64 - width),
+                    width,
+                    big_endian: false,
+                    ..field
+                }
+            }
+            _ => field,
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn what_was_decoded_is_encoded_to_the_same_bits(
+            field in any_typed_field(), data in any::<[u8; 8]>(), around in any::<[u8; 8]>()
+        ) {
+            let value = decode(&field, &data).unwrap();
+            let mut written = around;
+            match encode(&field, &Scale::IDENTITY, value, &mut written) {
+                Ok(()) => {
+                    prop_assert_eq!(decode(&field, &written).unwrap(), value);
+                    let place = (u64::MAX >> (64 - field.width)) << field.bit;
+                    let apart = u64::from_le_bytes(written) ^ u64::from_le_bytes(around);
+                    prop_assert_eq!(apart & !place, 0, "its neighbours are as they were");
+                    let theirs = u64::from_le_bytes(written) ^ u64::from_le_bytes(data);
+                    prop_assert_eq!(theirs & place, 0);
+                }
+                Err(error) => {
+                    prop_assert_eq!(error, EncodeError::NotFinite);
+                    prop_assert!(!value.as_f64().is_finite());
+                    prop_assert_eq!(written, around);
+                }
+            }
+        }
+
+        #[test]
+        fn a_scaled_number_comes_back_from_its_value(
+            field in any_field(), signed in any::<bool>(), data in any::<[u8; 8]>(),
+            multiply in prop_oneof![Just(100.0), Just(0.1), Just(-0.001), Just(1.0)],
+            divide in prop_oneof![Just(255.0), Just(1.0), Just(10.0)],
+            add in prop_oneof![Just(0.0), Just(-273.15), Just(40.0)],
+        ) {
+            let kind = if signed { FieldKind::Signed } else { FieldKind::Unsigned };
+            // Beyond that a double cannot tell a number from the next one.
+            let field = Field { kind, ..field };
+            prop_assume!(field.width <= 40);
+            let factors = Scale { multiply, divide, add };
+            let raw = decode(&field, &data).unwrap();
+            let mut written = [0; 8];
+            encode(&field, &factors, scale(&factors, raw), &mut written).unwrap();
+            prop_assert_eq!(decode(&field, &written), Some(raw));
+        }
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused_and_not_cut() {
+        let into = |width, kind, value| {
+            let mut data = [0; 8];
+            encode(&field(0, width, kind), &Scale::IDENTITY, value, &mut data).map(|()| data[0])
+        };
+        assert_eq!(into(8, FieldKind::Unsigned, Value::Float(255.4)), Ok(255), "rounded");
+        assert_eq!(into(8, FieldKind::Unsigned, Value::Float(255.5)), Err(EncodeError::OutOfRange));
+        assert_eq!(into(8, FieldKind::Unsigned, Value::Signed(-1)), Err(EncodeError::OutOfRange));
+        assert_eq!(into(8, FieldKind::Signed, Value::Signed(-128)), Ok(0x80));
+        assert_eq!(into(8, FieldKind::Signed, Value::Signed(128)), Err(EncodeError::OutOfRange));
+        assert_eq!(into(8, FieldKind::Unsigned, Value::Float(f64::NAN)), Err(EncodeError::NotFinite));
+        assert_eq!(into(8, FieldKind::Unsigned, Value::Bool(true)), Err(EncodeError::NotANumber));
+        assert_eq!(into(32, FieldKind::Float, Value::Float(1e39)), Err(EncodeError::OutOfRange));
+        assert_eq!(into(1, FieldKind::Bool, Value::Unsigned(1)), Ok(1));
+        assert_eq!(into(1, FieldKind::Bool, Value::Unsigned(2)), Err(EncodeError::NotABit));
+        assert_eq!(into(0, FieldKind::Unsigned, Value::Unsigned(0)), Err(EncodeError::NoField));
+        assert_eq!(into(64, FieldKind::Unsigned, Value::Float(1e300)), Err(EncodeError::OutOfRange));
     }
 
     #[test]

@@ -297,7 +297,8 @@ impl<'a> NodeView<'a> {
     fn all_data_good(&self) -> bool {
         let tags = self.table.tags.get(self.def.tags.clone()).unwrap_or_default();
         tags.iter().zip(self.def.tags.clone()).all(|(tag, index)| {
-            matches!(tag.source, Source::Derived(_)) || self.image.tag(TagIndex(index)).quality.is_good()
+            matches!(tag.source, Source::Derived(_) | Source::Rpdo { .. })
+                || self.image.tag(TagIndex(index)).quality.is_good()
         })
     }
 
@@ -306,7 +307,7 @@ impl<'a> NodeView<'a> {
         let tags = self.table.tags.get(self.def.tags.clone()).unwrap_or_default();
         tags.iter().zip(self.def.tags.clone()).filter_map(|(tag, index)| match tag.source {
             Source::Pdo { pdo, .. } => Some((pdo, self.image.tag(TagIndex(index)).quality)),
-            Source::Derived(_) | Source::Polled { .. } | Source::Adopted { .. } => None,
+            Source::Derived(_) | Source::Polled { .. } | Source::Adopted { .. } | Source::Rpdo { .. } => None,
         })
     }
 

@@ -11,6 +11,10 @@ pub fn source_text(table: &TagTable, node: &NodeDef, source: &Source) -> String 
             let number = node.canopen.pdos.get(*pdo).map_or(0, |pdo| pdo.number);
             format!("TPDO{number} {}", field_text(*field))
         }
+        Source::Rpdo { rpdo, field, .. } => {
+            let number = node.rpdos.get(*rpdo).map_or(0, |rpdo| rpdo.number);
+            format!("RPDO{number} {}", field_text(*field))
+        }
         Source::Polled { poll, .. } => {
             let object = node.canopen.polls.get(*poll).map(|poll| poll.object);
             object.map_or_else(String::new, |object| format!("SDO {object}"))

@@ -2,7 +2,7 @@
 
 use super::json::{JsonWriter, is_representable};
 use super::outbox::OutboxReport;
-use crate::mapping::{AlarmDef, Objection, TagDef, TagTable};
+use crate::mapping::{AlarmDef, Objection, Source, TagDef, TagTable};
 use crate::process_image::{
     AlarmStatus, Event, NmtState, NodeIndex, NodeStatus, Priority, ProcessImage, Quality, Sample, TagIndex,
     Value,
@@ -50,7 +50,9 @@ pub fn state(out: &mut String, table: &TagTable, image: &ProcessImage, node: Nod
         let places = def.tags.clone().map(TagIndex);
         places.zip(tags).filter(|(_, tag)| tag.published).map(|(index, tag)| (tag, image.tag(index)))
     };
-    let quality = published().map(|(_, sample)| sample.quality).max().unwrap_or(Quality::Good);
+    // What is sent to the device says nothing of how far its own values can be trusted.
+    let received = published().filter(|(tag, _)| !matches!(tag.source, Source::Rpdo { .. }));
+    let quality = received.map(|(_, sample)| sample.quality).max().unwrap_or(Quality::Good);
     let mut json = JsonWriter::object(out);
     json.integer("v", 1);
     json.optional_integer("ts", status.and_then(|status| status.newest_data).map(Timestamp::as_millis));

@@ -48,6 +48,8 @@ pub enum Reason {
     OtherUnit,
     /// The device does not tell how many decimal digits its whole numbers have.
     UnknownDigits,
+    /// The gateway has not sent it to the device, or it did not leave.
+    NotSent,
 }
 
 impl Quality {
@@ -113,6 +115,7 @@ impl Reason {
             Self::UnknownUnit => "unknown_unit",
             Self::OtherUnit => "other_unit",
             Self::UnknownDigits => "unknown_digits",
+            Self::NotSent => "not_sent",
         }
     }
 }

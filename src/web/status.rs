@@ -220,9 +220,10 @@ fn tags<'a>(table: &'a TagTable, image: &ProcessImage, def: &NodeDef, now: Insta
 /// Whether a source gives bits or numbers.
 fn kind(source: &Source) -> &'static str {
     let bit = match source {
-        Source::Pdo { field, .. } | Source::Polled { field, .. } | Source::Adopted { field, .. } => {
-            field.kind == FieldKind::Bool
-        }
+        Source::Pdo { field, .. }
+        | Source::Polled { field, .. }
+        | Source::Adopted { field, .. }
+        | Source::Rpdo { field, .. } => field.kind == FieldKind::Bool,
         Source::Derived(derived) => {
             matches!(derived, Derived::Bit { .. } | Derived::Logic { .. } | Derived::Latch { .. })
         }

@@ -77,7 +77,8 @@ impl Bench {
         accepted
     }
 
-    fn drain(&mut self) {
+    /// Takes down what the network wants done.
+    pub(super) fn drain(&mut self) {
         while let Some(output) = self.network.poll_output() {
             let text = match output {
                 NetworkOutput::Transmit(frame) => frame.to_string(),

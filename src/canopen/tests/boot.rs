@@ -11,7 +11,7 @@ use crate::canopen::polls::Poll;
 use crate::canopen::sdo::SdoSettings;
 use crate::canopen::{
     ErrorControl, Network, NetworkOutput, NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex,
-    PdoSettings,
+    PdoSettings, RpdoIndex, RpdoSettings, RpdoTrigger,
 };
 use crate::time::Now;
 
@@ -101,6 +101,8 @@ struct Plant {
     /// Of each reading of the polled object whether it succeeded.
     polled: Vec<bool>,
     nmt: Vec<String>,
+    /// When RPDOs were sent.
+    rpdos: Vec<u64>,
 }
 
 fn setup(mode: MappingMode, set_invalid: bool) -> PdoSetup {
@@ -149,6 +151,14 @@ impl Plant {
                 synchronous: false,
                 shortest_period: None,
             }],
+            rpdos: vec![RpdoSettings {
+                number: 1,
+                cob_id: CanId::Standard(0x201),
+                length: 2,
+                trigger: RpdoTrigger::Event,
+                refresh: Some(Duration::from_secs(1)),
+                inhibit: Duration::ZERO,
+            }],
             ..detcon(1)
         };
         let network = Network::new(master(vec![node]), Now::from_millis(0));
@@ -160,6 +170,7 @@ impl Plant {
             begun: 0,
             polled: Vec::new(),
             nmt: Vec::new(),
+            rpdos: Vec::new(),
         }
     }
 
@@ -173,6 +184,9 @@ impl Plant {
                         let state = [self.device.state.code()];
                         let heartbeat = CanFrame::data_frame(CanId::Standard(0x701), &state).unwrap();
                         self.network.handle_frame(Now::from_millis(self.now), &heartbeat);
+                    }
+                    if frame.id() == CanId::Standard(0x201) {
+                        self.rpdos.push(self.now);
                     }
                     if let Some(answer) = self.device.answer(&frame) {
                         self.network.handle_frame(Now::from_millis(self.now), &answer);
@@ -400,4 +414,49 @@ fn r_dst_071_088_a_stopped_node_is_not_read_and_its_polled_values_are_not_kept_a
     plant.polled.clear();
     plant.run(3000);
     assert!(plant.polled.len() >= 2 && plant.polled.iter().all(|good| !*good), "{:?}", plant.polled);
+}
+
+/// The device with an RPDO that carries 0x6411:1 at 0x201, looked at before it is started.
+fn with_rpdo(mode: MappingMode, cob_id: u32) -> Plant {
+    let setup = PdoSetup {
+        maps: vec![MappedObject::from_entry(0x6411_0110)],
+        transmission_type: None,
+        event_timer: None,
+        ..setup(mode, false)
+    };
+    let mut plant = Plant::new(vec![
+        BootStep::Write { object: object(0x1017, 0), data: 500_u16.to_le_bytes().to_vec(), optional: false },
+        BootStep::Rpdo(setup),
+    ]);
+    plant.device.objects.extend([
+        (object(0x1400, 1), cob_id.to_le_bytes().to_vec()),
+        (object(0x1400, 2), vec![255]),
+        (object(0x1600, 0), vec![1]),
+        (object(0x1600, 1), 0x6200_0108_u32.to_le_bytes().to_vec()),
+    ]);
+    let node = NodeId::new(1).unwrap();
+    plant.network.set_rpdo(Now::from_millis(0), node, RpdoIndex(0), Some([0; 8]));
+    plant.link_up().run(3_000);
+    plant
+}
+
+#[test]
+fn an_rpdo_is_mapped_as_the_file_says_before_the_first_is_sent() {
+    let plant = with_rpdo(MappingMode::Write, 0x201);
+    assert_eq!(plant.written(), ["0x1017:0", "0x1600:0", "0x1600:1", "0x1600:0"]);
+    assert_eq!(plant.device.objects[&object(0x1600, 1)], 0x6411_0110_u32.to_le_bytes());
+    let done = plant.told.iter().position(|event| matches!(event, BootEvent::Done { .. }));
+    assert!(done.is_some(), "{:?}", plant.told);
+    assert!(!plant.rpdos.is_empty() && plant.rpdos[0] > 20, "{:?}", plant.rpdos);
+}
+
+#[test]
+fn an_rpdo_that_the_device_takes_otherwise_is_not_sent() {
+    for (mode, cob_id) in
+        [(MappingMode::Verify, 0x201), (MappingMode::Write, 0x202), (MappingMode::Write, 0x8000_0201)]
+    {
+        let plant = with_rpdo(mode, cob_id);
+        assert!(plant.nmt.contains(&"000#0101".to_owned()), "the node runs all the same");
+        assert_eq!(plant.rpdos, Vec::<u64>::new(), "{mode:?} {cob_id:X}");
+    }
 }

@@ -3,13 +3,16 @@
 //! - `bench`: frames in candump notation in, lines of text out.
 //! - `worked_examples`: guarding and boot-up, step by step.
 //! - `boot`: a node that is configured before it is started.
+//! - `broadcasts`: SYNC and TIME. `supply`: RPDOs.
 //! - `duties`: starting, orders, TPDOs, heartbeat.
 //! - `surroundings`: other masters, strangers, duplicate ids, the passive role, a bus that fails.
 //! - `properties`: random input; a day of quiet guarding.
 
 mod bench;
 mod boot;
+mod broadcasts;
 mod duties;
 mod properties;
+mod supply;
 mod surroundings;
 mod worked_examples;

@@ -9,9 +9,13 @@ use super::bench::{detcon, master, usable};
 use crate::can::{CanFrame, CanId};
 use crate::canopen::{
     ErrorControl, GuardingSettings, Network, NetworkOutput, NetworkSettings, NmtRequest, NmtState, NodeEvent,
-    NodeId, NodeSettings, Role, StartSettings, cob_id,
+    NodeId, NodeSettings, Role, RpdoIndex, RpdoSettings, RpdoTrigger, StartSettings, SyncSettings,
+    TimeSettings, cob_id,
 };
 use crate::time::Now;
+
+/// What node 1 is sent.
+const RPDO: CanId = CanId::Standard(0x201);
 
 /// One thing that can happen to a network.
 #[derive(Clone, Debug)]
@@ -77,14 +81,34 @@ fn any_network() -> impl Strategy<Value = NetworkSettings> {
         1 => Just(ErrorControl::Heartbeat { timeout: Duration::from_millis(300) }),
         1 => Just(ErrorControl::None),
     ];
-    (any::<bool>(), any::<bool>(), control.clone(), control, any::<bool>()).prop_map(
-        |(passive, start_broadcast, first, second, auto_start)| NetworkSettings {
+    let sync = SyncSettings {
+        cob_id: cob_id::SYNC,
+        produced: true,
+        period: Some(Duration::from_millis(70)),
+        overflow: Some(9),
+        window: None,
+    };
+    let time = TimeSettings { cob_id: cob_id::TIME, period: Duration::from_millis(90), unsynchronised: true };
+    let rpdo = RpdoSettings {
+        number: 1,
+        cob_id: RPDO,
+        length: 3,
+        trigger: RpdoTrigger::Event,
+        refresh: Some(Duration::from_millis(50)),
+        inhibit: Duration::ZERO,
+    };
+    (any::<bool>(), any::<bool>(), control.clone(), control, any::<bool>(), any::<bool>()).prop_map(
+        move |(passive, start_broadcast, first, second, auto_start, sends)| NetworkSettings {
             role: if passive { Role::Passive } else { Role::Master },
             start_broadcast,
-            sync: None,
-            time: None,
+            sync: sends.then_some(sync),
+            time: sends.then_some(time),
             nodes: vec![
-                NodeSettings { error_control: first, ..detcon(1) },
+                NodeSettings {
+                    error_control: first,
+                    rpdos: if sends { vec![rpdo.clone()] } else { Vec::new() },
+                    ..detcon(1)
+                },
                 NodeSettings {
                     error_control: second,
                     start: StartSettings { auto_start, ..StartSettings::default() },
@@ -111,12 +135,14 @@ fn take(network: &mut Network, clock: &mut u64, step: &Step) -> Vec<NetworkOutpu
     std::iter::from_fn(|| network.poll_output()).collect()
 }
 
-fn is_allowed(frame: &CanFrame, broadcast: bool) -> bool {
+fn is_allowed(frame: &CanFrame, settings: &NetworkSettings) -> bool {
+    let broadcast = settings.start_broadcast;
+    let sent = !frame.is_remote() && [cob_id::SYNC, cob_id::TIME, RPDO].contains(&frame.id());
     let ids = [1, 2].map(|id| NodeId::new(id).unwrap());
     let start = ids.iter().any(|id| *frame == NmtRequest::Start.frame(Some(*id)))
         || broadcast && *frame == NmtRequest::Start.frame(None);
     let guard = frame.is_remote() && ids.iter().any(|id| frame.id() == cob_id::error_control(*id));
-    start || guard
+    start || guard || sent && settings.sync.is_some()
 }
 
 proptest! {
@@ -128,12 +154,13 @@ proptest! {
         steps in prop::collection::vec(any_step(), 1..200),
     ) {
         let mut network = usable(settings.clone());
+        network.set_rpdo(Now::from_millis(0), NodeId::new(1).unwrap(), RpdoIndex(0), Some([7; 8]));
         let mut clock = 0;
         for step in &steps {
             for output in take(&mut network, &mut clock, step) {
                 if let NetworkOutput::Transmit(frame) = output {
                     prop_assert!(settings.role == Role::Master, "{frame} in the passive role");
-                    prop_assert!(is_allowed(&frame, settings.start_broadcast), "{frame}");
+                    prop_assert!(is_allowed(&frame, &settings), "{frame}");
                 }
             }
         }

@@ -7,6 +7,7 @@ use super::super::{At, SourceText};
 use super::items::Entry;
 use super::node::Tpdo;
 use super::problems::Problems;
+use super::rpdo;
 use super::tags::Context;
 use super::{node, units};
 use crate::canopen::PdoIndex;
@@ -42,10 +43,10 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
                 refuse_changes(problems, context, tpdo);
                 MappingMode::Adopt { timed: node::is_untimed(context, section) }
             }
-            _ if section.maps.is_empty() => continue,
-            MappingWord::Fixed => continue,
-            MappingWord::Write => MappingMode::Write,
-            MappingWord::Verify => MappingMode::Verify,
+            word => match mapping_mode(word).filter(|_| !section.maps.is_empty()) {
+                Some(mode) => mode,
+                None => continue,
+            },
         };
         let mut number = |at: Option<(&SourceText, &At<u64>)>, what: &str, highest: u64| {
             at.map(|(source, at)| problems.within(source, at, what, 0..=highest))
@@ -73,7 +74,17 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
     if steps.len() > before_pdos {
         steps.insert(before_pdos, BootStep::Read { object: EMERGENCY_ID });
     }
+    steps.extend(rpdo::steps(context));
     steps
+}
+
+/// What is done with a PDO mapping; `None`: nothing, or it is taken as it is.
+pub fn mapping_mode(word: MappingWord) -> Option<MappingMode> {
+    match word {
+        MappingWord::Fixed | MappingWord::Adopt => None,
+        MappingWord::Write => Some(MappingMode::Write),
+        MappingWord::Verify => Some(MappingMode::Verify),
+    }
 }
 
 /// What is adopted is not changed.

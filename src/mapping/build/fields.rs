@@ -57,22 +57,17 @@ pub fn field(
     section: &TagSection,
 ) -> (usize, Field) {
     let source = context.source;
-    let (kind, width) = parse(&section.kind.value).unwrap_or_else(|| {
-        let message = format!("there is no type `{}`", section.kind.value);
-        problems.error(source, &section.kind.span, message, "use bool, u1 to u64, i2 to i64, f32 or f64");
-        (FieldKind::Unsigned, 1)
-    });
-    let stride = section.array.as_ref().and_then(|array| array.value.bit_stride.as_ref());
-    let stride =
-        stride.map_or(u64::from(width), |stride| problems.within(source, stride, "bit_stride", 1..=64));
+    let stride = stride(problems, source, section);
     let Some((number, first)) = place(problems, context, item, section) else {
-        return (NO_TPDO, Field { bit: 0, width, kind, big_endian: false, invert: section.invert });
+        let field = of_type(problems, context, section, 0);
+        return (NO_TPDO, Field { big_endian: false, ..field });
     };
     let bit = first.value.saturating_add(item.element.index.saturating_mul(stride));
+    let field = of_type(problems, context, section, bit);
     let (number_span, bit_span) = (&number.span, &first.span);
     let number = number.value;
     let pdo = context.tpdos.iter().position(|tpdo| tpdo.number == number);
-    match pdo.and_then(|place| context.tpdos.get(place)).map(|tpdo| tpdo.section) {
+    match pdo.and_then(|place| context.tpdos.get(place)) {
         // A TPDO whose entry is wrong has been told already.
         None if context.items.is_lost(&number.to_string()) || context.tpdos.iter().any(Tpdo::is_misnamed) => {
         }
@@ -86,8 +81,8 @@ pub fn field(
             problems.error(source, number_span, format!("there is no [tpdo.{number}]"), hint);
         }
         Some(tpdo) => {
-            let bits = node::length(tpdo).unwrap_or(8).min(8) * 8;
-            let last = bit.saturating_add(u64::from(width) - 1);
+            let bits = tpdo.frame().length().unwrap_or(8).min(8) * 8;
+            let last = bit.saturating_add(u64::from(field.width) - 1);
             if last >= bits {
                 let message = format!(
                     "`{}` takes bits {bit} to {last}, but TPDO {number} has only {bits} bits",
@@ -98,15 +93,32 @@ pub fn field(
             }
         }
     }
-    let field = Field {
+    check_byte_order(problems, source, bit_span, &item.name, field);
+    (pdo.unwrap_or(NO_TPDO), field)
+}
+
+/// Bits from one element of an array to the next.
+pub fn stride(problems: &mut Problems, source: &SourceText, section: &TagSection) -> u64 {
+    let width = parse(&section.kind.value).map_or(1, |(_, width)| width);
+    let stride = section.array.as_ref().and_then(|array| array.value.bit_stride.as_ref());
+    stride.map_or(u64::from(width), |stride| problems.within(source, stride, "bit_stride", 1..=64))
+}
+
+/// The field of a tag that begins at this bit.
+pub fn of_type(problems: &mut Problems, context: &Context<'_>, section: &TagSection, bit: u64) -> Field {
+    let (kind, width) = parse(&section.kind.value).unwrap_or_else(|| {
+        let message = format!("there is no type `{}`", section.kind.value);
+        let hint = "use bool, u1 to u64, i2 to i64, f32 or f64";
+        problems.error(context.source, &section.kind.span, message, hint);
+        (FieldKind::Unsigned, 1)
+    });
+    Field {
         bit: u8::try_from(bit).unwrap_or(u8::MAX),
         width,
         kind,
         big_endian: section.byte_order == ByteOrderWord::Big,
         invert: section.invert,
-    };
-    check_byte_order(problems, source, bit_span, &item.name, field);
-    (pdo.unwrap_or(NO_TPDO), field)
+    }
 }
 
 /// Where a tag stands: as it is written, or where the TPDO that maps its object has it.

@@ -4,7 +4,7 @@
 //! - `items`: the tags of a mapping, arrays unrolled. `tags`, `fields`, `derived`: what they become; `units`: those of the device.
 //! - `node`: what the CANopen master needs to know; `boot`: what it does before it starts the node.
 //! - `alarms`: alarms, their order and what suppresses them.
-//! - `broadcasts`: SYNC and TIME of a bus; `sync`: PDOs that go with SYNC.
+//! - `broadcasts`: SYNC and TIME of a bus; `sync`: PDOs that go with SYNC; `rpdo`: what nodes are sent.
 //! - `addresses`, `network`: what must not happen twice among nodes.
 //! - `order`: causes before consequences. `problems`: where messages are collected.
 //! - [`sketch`]: an installation without a configuration file.
@@ -20,6 +20,7 @@ mod network;
 mod node;
 mod order;
 mod problems;
+mod rpdo;
 pub mod sketch;
 mod sync;
 mod tags;
@@ -36,6 +37,7 @@ use self::network::Taken;
 use self::node::Tpdo;
 use self::problems::Problems;
 pub use self::problems::{is_name, is_snake_case, sort_problems};
+use self::rpdo::Rpdo;
 pub use self::sketch::Sketch;
 use self::tags::Context;
 use super::file::MappingFile;
@@ -222,6 +224,7 @@ impl Builder<'_> {
             entry,
             bus: bus.and_then(|bus| self.table.buses.get(bus.0)).cloned(),
             tpdos: Tpdo::all(file, entry),
+            rpdos: Rpdo::all(file),
             items,
             node: NodeIndex(self.table.nodes.len()),
             base: self.table.tags.len(),
@@ -264,6 +267,7 @@ impl Builder<'_> {
     ) {
         let (tags, places) = tags::tags(problems, context);
         fields::check_overlaps(problems, context, &fields::all(context, &tags, &places));
+        rpdo::check_contents(problems, context, &tags, &places);
         self.claims.push(addresses::of_node(problems, context, name, unit_id, &tags, &places));
         sync::check_changes(problems, context);
         let canopen = node::settings(problems, context, id);
@@ -287,6 +291,8 @@ impl Builder<'_> {
             zero_on_bad: entry.zero_on_bad,
             tags: context.base..context.base + tags.len(),
             alarms: base..base + alarms.len(),
+            rpdos: context.rpdos.iter().map(Rpdo::def).collect(),
+            outputs: entry.outputs,
             reserved_bits: context.tpdos.iter().map(Tpdo::reserved_bits).collect(),
             publish: publish(problems, context, &places),
         });

@@ -81,16 +81,17 @@ impl Taken {
         settings: &NodeSettings,
     ) {
         let mut all = vec![("emergency".to_owned(), cob_id::emcy(settings.id))];
-        for pdo in &settings.pdos {
-            let what = format!("TPDO {}", pdo.number);
-            if let Some(purpose) = restricted(pdo.cob_id) {
+        let tpdos = settings.pdos.iter().map(|pdo| (format!("TPDO {}", pdo.number), pdo.cob_id));
+        let rpdos = settings.rpdos.iter().map(|pdo| (format!("RPDO {}", pdo.number), pdo.cob_id));
+        for (what, cob_id) in tpdos.chain(rpdos) {
+            if let Some(purpose) = restricted(cob_id) {
                 let message = format!(
-                    "{what} of node `{}` has identifier {}, which is kept for {purpose}",
-                    name.value, pdo.cob_id
+                    "{what} of node `{}` has identifier {cob_id}, which is kept for {purpose}",
+                    name.value
                 );
                 problems.error(config, &name.span, message, "check `cob_id` in the mapping");
             }
-            all.push((what, pdo.cob_id));
+            all.push((what, cob_id));
         }
         for (what, id) in all {
             let owner = format!("{what} of node `{}`", name.value);

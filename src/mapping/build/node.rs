@@ -8,8 +8,8 @@ use super::super::file::{MappingFile, MappingWord, TagSection, TpdoSection};
 use super::super::installation::{ErrorControlWord, NodeEntry, TpdoEntry};
 use super::boot;
 use super::problems::Problems;
-use super::sync;
 use super::tags::Context;
+use super::{rpdo, sync};
 use crate::canopen::boot::BootSettings;
 use crate::canopen::object::{MappedObject, ObjectId};
 use crate::canopen::sdo::SdoSettings;
@@ -43,7 +43,7 @@ pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> N
         sdo: (!steps.is_empty() || !polls.is_empty()).then(SdoSettings::default),
         boot: BootSettings { steps, ..BootSettings::default() },
         polls,
-        rpdos: Vec::new(),
+        rpdos: rpdo::settings(problems, context, id),
         never_seen_after: NEVER_SEEN_AFTER,
     }
 }
@@ -165,12 +165,8 @@ fn start(problems: &mut Problems, context: &Context<'_>) -> StartSettings {
 
 fn pdo(problems: &mut Problems, context: &Context<'_>, id: NodeId, pdo: &Tpdo<'_>) -> PdoSettings {
     let (source, key, tpdo) = (context.source, pdo.key, pdo.section);
-    let number = key.value.parse::<u16>().ok().filter(|number| (1..=512).contains(number));
-    if number.is_none_or(|number| number.to_string() != key.value) {
-        let message = format!("`{}` is not the number of a TPDO", key.value);
-        problems.error(source, &key.span, message, "write [tpdo.1] to [tpdo.512]");
-    }
-    let length = checked_length(problems, source, key, tpdo);
+    let number = pdo_number(problems, source, "tpdo", key);
+    let length = checked_length(problems, source, &pdo.frame());
     let millis = |problems: &mut Problems, at: &Option<At<u64>>, what: &str| {
         at.as_ref().map(|at| Duration::from_millis(problems.within(source, at, what, 1..=LONGEST_PERIOD)))
     };
@@ -198,7 +194,7 @@ fn pdo(problems: &mut Problems, context: &Context<'_>, id: NodeId, pdo: &Tpdo<'_
         }
     }
     PdoSettings {
-        number: number.unwrap_or_default(),
+        number,
         cob_id: tpdo.cob_id.value.of(id),
         length: u8::try_from(length).unwrap_or(8),
         strict_length: context.entry.strict_dlc.unwrap_or(tpdo.strict_dlc),
@@ -219,27 +215,55 @@ fn event_timer(context: &Context<'_>, tpdo: &Tpdo<'_>) -> Option<Duration> {
     Some(Duration::from_millis(at.value)).filter(|timer| !timer.is_zero())
 }
 
-/// The bytes of a TPDO, from what it maps or as they are written.
-pub fn length(tpdo: &TpdoSection) -> Option<u64> {
-    let bits: u64 =
-        tpdo.maps.iter().filter_map(|entry| mapped(&entry.value)).map(|each| u64::from(each.bits)).sum();
-    if tpdo.maps.is_empty() { tpdo.length.as_ref().map(|at| at.value) } else { Some(bits.div_ceil(8)) }
+/// The number of a PDO, by the name of its table; 0 where that is none, which is told.
+pub fn pdo_number(problems: &mut Problems, source: &SourceText, word: &str, key: &At<String>) -> u16 {
+    let number = key.value.parse::<u16>().ok().filter(|number| (1..=512).contains(number));
+    if number.is_none_or(|number| number.to_string() != key.value) {
+        let message = format!("`{}` is not the number of a {}", key.value, word.to_uppercase());
+        problems.error(source, &key.span, message, format!("write [{word}.1] to [{word}.512]"));
+    }
+    number.unwrap_or_default()
 }
 
-fn checked_length(problems: &mut Problems, source: &SourceText, key: &At<String>, tpdo: &TpdoSection) -> u64 {
-    for entry in &tpdo.maps {
+/// The frame of a PDO, whichever way it goes.
+#[derive(Clone, Copy, Debug)]
+pub struct Frame<'a> {
+    /// `TPDO` or `RPDO`.
+    pub what: &'static str,
+    /// Its number as it is written.
+    pub key: &'a At<String>,
+    /// What it carries.
+    pub maps: &'a [At<String>],
+    /// Its bytes, where they do not follow from that.
+    pub length: Option<&'a At<u64>>,
+    /// The device says how long it is.
+    pub is_adopted: bool,
+}
+
+impl Frame<'_> {
+    /// Its bytes, from what it maps or as they are written.
+    pub fn length(&self) -> Option<u64> {
+        let mapped = self.maps.iter().filter_map(|entry| mapped(&entry.value));
+        let bits: u64 = mapped.map(|each| u64::from(each.bits)).sum();
+        if self.maps.is_empty() { self.length.map(|at| at.value) } else { Some(bits.div_ceil(8)) }
+    }
+}
+
+/// The bytes of a PDO; 8 where they are not known, which is told.
+pub fn checked_length(problems: &mut Problems, source: &SourceText, frame: &Frame<'_>) -> u64 {
+    for entry in frame.maps {
         if mapped(&entry.value).is_none() {
             let message = format!("`{}` is no mapped object", entry.value);
             problems.error(source, &entry.span, message, "write index, sub-index and bits: \"0x6130:1/32\"");
         }
     }
-    let span = tpdo.maps.first().map(|entry| &entry.span).or(tpdo.length.as_ref().map(|at| &at.span));
-    let Some((length, span)) = length(tpdo).zip(span) else {
-        if tpdo.mapping == MappingWord::Adopt {
+    let span = frame.maps.first().map(|entry| &entry.span).or(frame.length.map(|at| &at.span));
+    let Some((length, span)) = frame.length().zip(span) else {
+        if frame.is_adopted {
             return 8;
         }
-        let hint = "give it `length`, or `maps`";
-        problems.error(source, &key.span, format!("the length of TPDO {} is not known", key.value), hint);
+        let message = format!("the length of {} {} is not known", frame.what, frame.key.value);
+        problems.error(source, &frame.key.span, message, "give it `length`, or `maps`");
         return 8;
     };
     problems.within(source, &At { value: length, span: span.clone() }, "length", 1..=8)
@@ -263,10 +287,10 @@ pub fn object(problems: &mut Problems, source: &SourceText, text: &At<String>) -
     }
 }
 
-/// Where an object stands in a TPDO.
-pub fn bit_of(tpdo: &TpdoSection, object: ObjectId) -> Option<u64> {
+/// Where an object stands in a PDO that carries these.
+pub fn bit_of(maps: &[At<String>], object: ObjectId) -> Option<u64> {
     let mut bit = 0;
-    for entry in &tpdo.maps {
+    for entry in maps {
         let entry = mapped(&entry.value)?;
         if entry.object == object {
             return Some(bit);
@@ -280,20 +304,21 @@ pub fn bit_of(tpdo: &TpdoSection, object: ObjectId) -> Option<u64> {
 /// device has the last word on it.
 pub fn in_pdo(context: &Context<'_>, object: ObjectId) -> Option<(u64, u64)> {
     let mut known = context.tpdos.iter().filter(|tpdo| !tpdo.is_adopted());
-    known.find_map(|tpdo| Some((tpdo.number, bit_of(tpdo.section, object)?)))
+    known.find_map(|tpdo| Some((tpdo.number, bit_of(&tpdo.section.maps, object)?)))
 }
 
 /// The object and period of a tag that no TPDO maps.
 pub fn polled<'a>(context: &Context<'_>, section: &'a TagSection) -> Option<(ObjectId, &'a At<u64>)> {
     let object = section.object.as_ref()?.value.parse().ok()?;
-    Some((object, section.poll_ms.as_ref()?)).filter(|_| in_pdo(context, object).is_none())
+    Some((object, section.poll_ms.as_ref()?))
+        .filter(|_| in_pdo(context, object).is_none() && section.rpdo.is_none())
 }
 
 /// The object of a tag that is looked for in the TPDOs that are adopted.
 pub fn adopted(context: &Context<'_>, section: &TagSection) -> Option<ObjectId> {
     let object = section.object.as_ref()?.value.parse().ok()?;
     let adopts = context.tpdos.iter().any(Tpdo::is_adopted);
-    Some(object).filter(|object| adopts && in_pdo(context, *object).is_none())
+    Some(object).filter(|object| adopts && section.rpdo.is_none() && in_pdo(context, *object).is_none())
 }
 
 /// One TPDO of a mapping.
@@ -348,6 +373,18 @@ impl<'a> Tpdo<'a> {
     /// Whether it is taken as the device has it.
     pub fn is_adopted(&self) -> bool {
         self.section.mapping == MappingWord::Adopt
+    }
+
+    /// Its frame.
+    pub fn frame(&self) -> Frame<'a> {
+        let section = self.section;
+        Frame {
+            what: "TPDO",
+            key: self.key,
+            maps: &section.maps,
+            length: section.length.as_ref(),
+            is_adopted: self.is_adopted(),
+        }
     }
 
     /// Whether its number is none.

@@ -16,7 +16,8 @@ use super::items::{Element, Entry, Item, Items};
 use super::node::Tpdo;
 use super::order::causes_first;
 use super::problems::{Problems, matched};
-use super::{derived, fields, node, units};
+use super::rpdo::Rpdo;
+use super::{derived, fields, node, rpdo, units};
 use crate::process_image::{NodeIndex, TagIndex};
 
 /// Lowest register address of device data; below are those of the node itself.
@@ -60,6 +61,8 @@ pub struct Context<'a> {
     pub bus: Option<BusDef>,
     /// Its TPDOs, by their numbers.
     pub tpdos: Vec<Tpdo<'a>>,
+    /// Its RPDOs, by their numbers.
+    pub rpdos: Vec<Rpdo<'a>>,
     /// All tags, unrolled.
     pub items: Items<'a>,
     /// The node.
@@ -184,30 +187,50 @@ fn parameter(
 }
 
 fn from_pdo(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, section: &TagSection) -> TagDef {
-    let (pdo, mut field) = fields::field(problems, context, item, section);
     let scale = scale(problems, context, section.scale.as_ref());
+    let mut source = match &section.rpdo {
+        Some(rpdo) => rpdo::source(problems, context, item, section, rpdo, scale),
+        None => {
+            rpdo::refuse_limits(problems, context, section);
+            let (pdo, field) = fields::field(problems, context, item, section);
+            let poll = fields::poll(context, item).zip(fields::whole(section));
+            match (node::adopted(context, section), poll) {
+                (Some(object), poll) => {
+                    let field = Field { bit: 0, ..field };
+                    Source::Adopted { object, poll: poll.map(|(poll, _)| poll), field, scale }
+                }
+                (None, Some((poll, field))) => Source::Polled { poll, field, scale },
+                (None, None) => Source::Pdo { pdo, field, scale },
+            }
+        }
+    };
+    let mut is_float = false;
+    if let Source::Pdo { field, .. }
+    | Source::Polled { field, .. }
+    | Source::Adopted { field, .. }
+    | Source::Rpdo { field, .. } = &mut source
+    {
+        change_field(problems, context, item, field);
+        is_float = field.kind == FieldKind::Float;
+    }
+    let received = section.rpdo.is_none();
+    let device_unit = received.then(|| units::device_unit(problems, context, item, section)).flatten();
+    let scaled = scale != Scale::IDENTITY || is_float || device_unit.is_some();
+    let usual_decimals = if scaled { 2 } else { 0 };
+    let tag = finished(problems, context, item, section.shared(), usual_decimals, source);
+    TagDef { device_unit, ..tag }
+}
+
+/// What the installation changes of the bits of a tag.
+fn change_field(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, field: &mut Field) {
     let overrides = overrides(context, &item.name);
     for (_, entry) in &overrides {
         field.invert = entry.invert.as_ref().map_or(field.invert, |invert| invert.value);
         if let Some(order) = &entry.byte_order {
             field.big_endian = order.value == ByteOrderWord::Big;
-            fields::check_byte_order(problems, context.config, &order.span, &item.name, field);
+            fields::check_byte_order(problems, context.config, &order.span, &item.name, *field);
         }
     }
-    let poll = fields::poll(context, item).zip(fields::whole(section));
-    let device_unit = units::device_unit(problems, context, item, section);
-    let scaled = scale != Scale::IDENTITY || field.kind == FieldKind::Float || device_unit.is_some();
-    let usual_decimals = if scaled { 2 } else { 0 };
-    let source = match (node::adopted(context, section), poll) {
-        (Some(object), poll) => {
-            let field = Field { bit: 0, ..field };
-            Source::Adopted { object, poll: poll.map(|(poll, _)| poll), field, scale }
-        }
-        (None, Some((poll, field))) => Source::Polled { poll, field, scale },
-        (None, None) => Source::Pdo { pdo, field, scale },
-    };
-    let tag = finished(problems, context, item, section.shared(), usual_decimals, source);
-    TagDef { device_unit, ..tag }
 }
 
 fn scale(problems: &mut Problems, context: &Context<'_>, section: Option<&At<ScaleSection>>) -> Scale {

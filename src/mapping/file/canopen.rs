@@ -90,6 +90,47 @@ pub struct TpdoSection {
     pub reserved_bits: Vec<At<[u64; 2]>>,
 }
 
+/// `[rpdo.NUMBER]`: what the gateway sends the device, where the configuration allows it (`outputs = true`).
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RpdoSection {
+    /// Its identifier: `"$NODEID+0x200"`, or a number; one above 0x7FF is a 29-bit identifier.
+    pub cob_id: At<CobId>,
+    /// Bytes that it has, 1..=8. Follows from `maps` where that is given.
+    pub length: Option<At<u64>>,
+    /// What it carries, in order, each `"0xINDEX:SUB/BITS"`.
+    #[serde(default)]
+    pub maps: Vec<At<String>>,
+    /// What is done where the node has another mapping: with `verify` nothing is sent. Default: write; without `maps` nothing
+    /// is read or written.
+    #[serde(default)]
+    pub mapping: MappingWord,
+    /// 254 and 255: sent when it changes; 1..=240: after every so many SYNCs; 0: after the next SYNC when it changed. With
+    /// `maps` written where it differs. Default: 255, and as the node has it.
+    pub transmission_type: Option<At<u64>>,
+    /// Sent again after this long without a change, 10..=3600000; 0 = not. Default: 1000.
+    pub refresh_ms: Option<At<u64>>,
+    /// At least this long between two frames, 0..=65535. Default: 10.
+    pub inhibit_ms: Option<At<u64>>,
+    /// What is sent when the node takes part again. Default: default.
+    #[serde(default)]
+    pub on_start: OnStartWord,
+    /// Mark the PDO as not valid while its mapping is changed. Default: false.
+    #[serde(default)]
+    pub set_pdo_invalid: bool,
+}
+
+/// What an RPDO begins with when its node takes part again.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OnStartWord {
+    /// The defaults of its tags; a tag without one has to be written again.
+    #[default]
+    Default,
+    /// The values that were written last.
+    Last,
+}
+
 /// `[identity]`: each key that is given must be what the node says.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]

@@ -19,7 +19,8 @@ use super::At;
 
 pub use alarms::{AlarmSection, BuiltinAlarmSection};
 pub use canopen::{
-    ErrorControlSection, IdentitySection, MappingWord, SetupSection, SetupValue, StartSection, TpdoSection,
+    ErrorControlSection, IdentitySection, MappingWord, OnStartWord, RpdoSection, SetupSection, SetupValue,
+    StartSection, TpdoSection,
 };
 pub use tags::*;
 
@@ -46,13 +47,16 @@ pub struct MappingFile {
     /// The TPDOs that it sends, by their number: `[tpdo.1]`.
     #[serde(default)]
     pub tpdo: BTreeMap<At<String>, TpdoSection>,
+    /// The RPDOs that it is sent, by their number: `[rpdo.1]`.
+    #[serde(default)]
+    pub rpdo: BTreeMap<At<String>, RpdoSection>,
     /// Objects that are written before it is started, where it has them otherwise.
     #[serde(default)]
     pub setup: Vec<SetupSection>,
     /// Constants that an installation can set for each node.
     #[serde(default)]
     pub parameter: Vec<ParameterSection>,
-    /// Values that stand in its TPDOs.
+    /// Values that stand in its TPDOs, or RPDOs.
     #[serde(default)]
     pub tag: Vec<TagSection>,
     /// Values computed from others.

@@ -93,8 +93,16 @@ tag_entry! {
     pub struct TagSection {
         /// Number of the TPDO that carries it, with `bit`; or `object` instead of both.
         pub tpdo: Option<At<u64>>,
+        /// Number of the RPDO in which the gateway sends it, with `bit` or `object`.
+        pub rpdo: Option<At<u64>>,
         /// Place of its lowest bit: byte b bit i = 8 b + i.
         pub bit: Option<At<u64>>,
+        /// What is sent before anything was written; tags of an RPDO only. Default: nothing is sent before.
+        pub default: Option<At<WrittenValue>>,
+        /// Lowest value that can be written; tags of an RPDO only. Default: what its type can hold.
+        pub minimum: Option<At<f64>>,
+        /// Highest value that can be written; tags of an RPDO only. Default: what its type can hold.
+        pub maximum: Option<At<f64>>,
         /// The object that it is, `"0xINDEX:SUB"`: taken from the TPDO that maps it, else read every `poll_ms`.
         pub object: Option<At<String>>,
         /// How often an object that no TPDO maps is read by SDO, 100..=86400000.
@@ -119,6 +127,18 @@ tag_entry! {
     }
     /// Digits after the decimal point, 0..=12. Default: 2 where it is scaled or a float, else 0.
     decimals
+}
+
+/// A value that can be written: a bit, or a number.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(untagged)]
+pub enum WrittenValue {
+    /// A bit.
+    Bit(bool),
+    /// A whole number.
+    Whole(i64),
+    /// Any other.
+    Real(f64),
 }
 
 /// `value = raw * multiply / divide + add`.

@@ -112,10 +112,23 @@ pub struct NodeDef {
     pub tags: Range<usize>,
     /// Its alarms; their order is that of the bits at discrete inputs 128 and 160 ([`AlarmDef::bit`]).
     pub alarms: Range<usize>,
+    /// RPDOs of its mapping, by their numbers.
+    pub rpdos: Vec<RpdoDef>,
+    /// The configuration allows that it is sent RPDOs: only then [`canopen`](Self::canopen) has them, at the same places.
+    pub outputs: bool,
     /// Reserved bits of each PDO, by [`PdoIndex`](crate::canopen::PdoIndex): a set one is counted (R-DET-052).
     pub reserved_bits: Vec<u64>,
     /// How often the MQTT state topic is published.
     pub publish: PublishDef,
+}
+
+/// An RPDO of a mapping.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RpdoDef {
+    /// Its number.
+    pub number: u16,
+    /// When the node takes part again, what was written last is sent, not the defaults.
+    pub keeps_last: bool,
 }
 
 /// A device type.

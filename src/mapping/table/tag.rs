@@ -2,7 +2,7 @@
 
 use super::{Derived, DeviceUnit};
 use crate::canopen::object::ObjectId;
-use crate::process_image::{NodeIndex, TagIndex};
+use crate::process_image::{NodeIndex, TagIndex, Value};
 
 /// The word in the place of a unit that only the device knows.
 pub const DEVICE_UNIT: &str = "device";
@@ -66,8 +66,35 @@ pub enum Source {
         /// From raw to engineering units.
         scale: Scale,
     },
+    /// Bits of an RPDO: what the gateway sends the node.
+    Rpdo {
+        /// Which, by its place in [`NodeDef::rpdos`](super::NodeDef::rpdos).
+        rpdo: usize,
+        /// Which bits, and how they are written.
+        field: Field,
+        /// From raw to engineering units.
+        scale: Scale,
+        /// What can be written.
+        limits: WriteLimits,
+    },
     /// Computed from other tags of the node.
     Derived(Derived),
+}
+
+/// What can be written to a tag, in engineering units.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WriteLimits {
+    /// What holds before anything was written; `None`: nothing is sent before.
+    pub default: Option<Value>,
+    /// Lowest value.
+    pub minimum: f64,
+    /// Highest value.
+    pub maximum: f64,
+}
+
+impl WriteLimits {
+    /// Whatever the type can hold, and no default.
+    pub const NONE: Self = Self { default: None, minimum: f64::NEG_INFINITY, maximum: f64::INFINITY };
 }
 
 /// Bits of a frame.
