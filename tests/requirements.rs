@@ -1,7 +1,7 @@
-//! Every requirement in `docs/requirements.md` has a test whose name cites it, on the side that it binds, or a reason
-//! why not.
+//! Every requirement in `docs/requirements/` has a test whose name cites it, on each side that it binds, or a reason why
+//! not; and the files that a row names hold such a test.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
@@ -23,23 +23,23 @@ pub fn tests_of(text: &str) -> BTreeSet<String> {
     names
 }
 
-/// Names of all tests under a folder.
-fn test_names(folder: &Path, into: &mut BTreeSet<String>) {
+/// The tests of every source file, by its path from the root of the project.
+fn tests_by_file(root: &Path, folder: &Path, into: &mut BTreeMap<String, BTreeSet<String>>) {
     for entry in fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
         if path.is_dir() {
-            test_names(&path, into);
+            tests_by_file(root, &path, into);
         } else if path.extension().is_some_and(|extension| extension == "rs") {
-            let text = fs::read_to_string(&path).unwrap();
-            into.extend(tests_of(&text));
+            let file = path.strip_prefix(root).unwrap().to_str().unwrap().to_owned();
+            into.insert(file, tests_of(&fs::read_to_string(&path).unwrap()));
         }
     }
 }
 
-/// The requirement numbers that a test's name cites: `r_det_007`, `r_det_007_008`, `r_det_007_to_010`.
-fn cited(name: &str) -> BTreeSet<u32> {
+/// The requirement numbers of a document that a test's name cites: `r_det_007`, `r_det_007_008`, `r_det_007_to_010`.
+fn cited(document: &str, name: &str) -> BTreeSet<u32> {
     let mut numbers = BTreeSet::new();
-    for part in name.split("r_det_").skip(1) {
+    for part in name.split(&format!("r_{document}_")).skip(1) {
         let mut words = part.split('_').peekable();
         let mut last = None;
         while let Some(word) = words.next() {
@@ -56,6 +56,91 @@ fn cited(name: &str) -> BTreeSet<u32> {
         }
     }
     numbers
+}
+
+/// Who has to do what a requirement asks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Side {
+    /// The simulated device.
+    Device,
+    Gateway,
+}
+
+impl Side {
+    const ALL: [(Self, &str); 2] = [(Self::Device, "dev"), (Self::Gateway, "gw")];
+
+    /// Tests of the simulator prove the device, all others the gateway.
+    fn of(file: &str) -> Self {
+        if file.starts_with("src/simulator/") { Self::Device } else { Self::Gateway }
+    }
+}
+
+/// How a remark begins that says why there is no test.
+const EXCUSE: &str = "no test: ";
+
+/// A line of a table.
+#[derive(Debug)]
+struct Row {
+    number: u32,
+    sides: Vec<Side>,
+    /// What it asks, in a few words.
+    title: String,
+    /// Files whose tests show it; not all of them.
+    shown_in: Vec<String>,
+    /// Anything else; with [`EXCUSE`] at its begin the row needs no test.
+    remark: String,
+}
+
+impl Row {
+    /// `| R-DET-001 | dev, gw | title | files | remark |`.
+    fn parse(document: &str, line: &str) -> Self {
+        let cells: Vec<&str> = line.trim_matches('|').split('|').map(str::trim).collect();
+        let [id, sides, title, shown_in, remark] = *cells.as_slice() else {
+            panic!("not five columns: {line}")
+        };
+        let number = id.strip_prefix(&format!("R-{}-", document.to_uppercase())).unwrap();
+        let side =
+            |word: &str| Side::ALL.iter().find(|(_, own)| *own == word).unwrap_or_else(|| panic!("{line}"));
+        Self {
+            number: number.parse().unwrap(),
+            sides: sides.split(", ").map(|word| side(word).0).collect(),
+            title: title.to_owned(),
+            shown_in: shown_in.split(", ").filter(|file| !file.is_empty()).map(file_of).collect(),
+            remark: remark.to_owned(),
+        }
+    }
+}
+
+/// `` `canopen/nmt.rs` `` is below `src/`, `` `tests/eds.rs` `` is what it says.
+fn file_of(cell: &str) -> String {
+    let name = cell.trim_matches('`');
+    if name.starts_with("tests/") { name.to_owned() } else { format!("src/{name}") }
+}
+
+/// What is wrong with a table, given the tests of every file.
+fn faults(document: &str, table: &str, tests: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
+    let cites = |file: &String, number: u32| {
+        tests.get(file).is_some_and(|names| names.iter().any(|name| cited(document, name).contains(&number)))
+    };
+    let id = format!("| R-{}-", document.to_uppercase());
+    let mut faults = Vec::new();
+    for (place, line) in table.lines().filter(|line| line.starts_with(&id)).enumerate() {
+        let row = Row::parse(document, line);
+        let Row { number, title, .. } = &row;
+        if usize::try_from(*number).unwrap() != place + 1 {
+            faults.push(format!("{number:03} does not follow the one before it"));
+        }
+        for (side, word) in Side::ALL.into_iter().filter(|(side, _)| row.sides.contains(side)) {
+            let proved = tests.keys().any(|file| Side::of(file) == side && cites(file, *number));
+            if !proved && !row.remark.starts_with(EXCUSE) {
+                faults.push(format!("{number:03} ({word}) has no test, and no reason why not: {title}"));
+            }
+        }
+        for file in row.shown_in.iter().filter(|file| !cites(file, *number)) {
+            faults.push(format!("{number:03} is not cited by a test in {file}: {title}"));
+        }
+    }
+    faults
 }
 
 #[test]
@@ -78,50 +163,55 @@ fn only_tests_that_run_are_a_proof() {
 
 #[test]
 fn citations_are_read_from_names() {
-    assert_eq!(cited("r_det_036_node_lost"), BTreeSet::from([36]));
-    assert_eq!(cited("v_det_01_r_det_007_to_010_start"), BTreeSet::from([7, 8, 9, 10]));
-    assert_eq!(cited("r_det_034_035_and_036_x_r_det_050"), BTreeSet::from([34, 35, 36, 50]));
-    assert_eq!(cited("no_requirement"), BTreeSet::new());
+    assert_eq!(cited("det", "r_det_036_node_lost"), BTreeSet::from([36]));
+    assert_eq!(cited("det", "v_det_01_r_det_007_to_010_start"), BTreeSet::from([7, 8, 9, 10]));
+    assert_eq!(cited("det", "r_det_034_035_and_036_x_r_det_050"), BTreeSet::from([34, 35, 36, 50]));
+    assert_eq!(cited("det", "no_requirement"), BTreeSet::new());
+}
+
+#[test]
+fn a_requirement_without_proof_on_each_of_its_sides_is_found() {
+    let file =
+        |name: &str, tests: &[&str]| (name.to_owned(), tests.iter().map(|test| (*test).to_owned()).collect());
+    let tests = BTreeMap::from([
+        file("src/simulator/slave.rs", &["r_sio_001_to_003_x", "r_det_004_x"]),
+        file("src/canopen/nmt.rs", &["r_sio_002_x"]),
+        file("tests/eds.rs", &["r_sio_004_x"]),
+    ]);
+    let table = "
+        | R-DET-001 | gw | another document | | |
+        | R-SIO-001 | dev, gw | gateway missing | `simulator/slave.rs` | |
+        | R-SIO-002 | dev, gw | both | `simulator/slave.rs`, `canopen/nmt.rs` | |
+        | R-SIO-003 | gw | a reason | | no test: left to the operator |
+        | R-SIO-004 | dev | only of another document | `tests/eds.rs`, `canopen/nmt.rs` | |
+        | R-SIO-006 | gw | a gap, and a remark that is no reason | | nice to have |
+    ";
+    let table = table.lines().map(str::trim).collect::<Vec<_>>().join("\n");
+    assert_eq!(
+        faults("sio", &table, &tests),
+        [
+            "001 (gw) has no test, and no reason why not: gateway missing",
+            "004 (dev) has no test, and no reason why not: only of another document",
+            "004 is not cited by a test in src/canopen/nmt.rs: only of another document",
+            "006 does not follow the one before it",
+            "006 (gw) has no test, and no reason why not: a gap, and a remark that is no reason",
+        ]
+    );
 }
 
 #[test]
 fn every_requirement_is_proved_or_says_why_not() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let collect = |folders: &[&str]| {
-        let mut names = BTreeSet::new();
-        for folder in folders {
-            test_names(&root.join(folder), &mut names);
-        }
-        names.iter().flat_map(|name| cited(name)).collect::<BTreeSet<u32>>()
-    };
-    let device = collect(&["src/simulator"]);
-    let gateway = {
-        let rooms = [
-            "src/can",
-            "src/canopen",
-            "src/mapping",
-            "src/alarms",
-            "src/gateway",
-            "src/process_image",
-            "src/config",
-        ];
-        let mut all = collect(&rooms);
-        all.extend(collect(&["src/modbus", "src/mqtt", "src/web", "src/supervisor", "src/cli", "tests"]));
-        all
-    };
-    let table = fs::read_to_string(root.join("docs/requirements.md")).unwrap();
-    let mut unproved = Vec::new();
-    let mut rows = 0;
-    for row in table.lines().filter(|line| line.starts_with("| R-DET-")) {
-        rows += 1;
-        let cells: Vec<&str> = row.trim_matches('|').split('|').map(str::trim).collect();
-        let number: u32 = cells[0].trim_start_matches("R-DET-").parse().unwrap();
-        for (side, proved) in [("dev", &device), ("gw", &gateway)] {
-            if cells[1].contains(side) && !proved.contains(&number) && cells[3].is_empty() {
-                unproved.push(format!("{} ({side}): {}", cells[0], cells[2]));
-            }
-        }
+    let mut tests = BTreeMap::new();
+    for folder in ["src", "tests"] {
+        tests_by_file(root, &root.join(folder), &mut tests);
     }
-    assert_eq!(rows, 92, "a row of the table is gone");
-    assert!(unproved.is_empty(), "no test cites these, and no reason is given:\n{}", unproved.join("\n"));
+    for (document, file, rows) in [("det", "detcon.md", 92), ("dst", "dst-p92c.md", 124)] {
+        let table = fs::read_to_string(root.join("docs/requirements").join(file)).unwrap();
+        let id = format!("| R-{}-", document.to_uppercase());
+        let there = table.lines().filter(|line| line.starts_with(&id)).count();
+        assert_eq!(there, rows, "{file}: a row is gone, or new");
+        let faults = faults(document, &table, &tests);
+        assert!(faults.is_empty(), "{file}:\n{}", faults.join("\n"));
+    }
 }
