@@ -139,7 +139,7 @@ pub struct NodeEntry {
     #[serde(default)]
     pub parameters: BTreeMap<At<String>, At<f64>>,
     /// How the life of the node is watched (R-DET-044).
-    pub error_control: Option<ErrorControlWord>,
+    pub error_control: Option<At<ErrorControlWord>>,
     /// Time between two guard requests, 20..=65535 ms; 0 = guarding off (R-DET-031).
     pub guard_time_ms: Option<At<u64>>,
     /// Missed replies in a row until the node is lost, 1..=255 (R-DET-032).

@@ -152,7 +152,8 @@ fn r_det_043_somebody_elses_guard_request_is_told() {
 
 #[test]
 fn r_det_044_heartbeat_sends_no_request_and_loses_the_node_by_silence() {
-    let mut conversation = detcon_with(|_, node| node.error_control = Some(ErrorControlWord::Heartbeat));
+    let mut conversation =
+        detcon_with(|_, node| node.error_control = Some(At::nowhere(ErrorControlWord::Heartbeat)));
     conversation.send_cyclically("701#05", 1_000);
     conversation.run_to(5_000);
     assert!(conversation.node().online && conversation.node().supervised);

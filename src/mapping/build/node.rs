@@ -128,7 +128,7 @@ fn error_control(problems: &mut Problems, context: &Context<'_>) -> ErrorControl
         }
         reply_timeout = guard_time;
     }
-    match entry.error_control.unwrap_or(file.kind) {
+    match kind(problems, context) {
         ErrorControlWord::None => ErrorControl::None,
         ErrorControlWord::Guarding if off => ErrorControl::None,
         ErrorControlWord::Heartbeat => ErrorControl::Heartbeat { timeout },
@@ -142,6 +142,21 @@ fn error_control(problems: &mut Problems, context: &Context<'_>) -> ErrorControl
             settle,
         }),
     }
+}
+
+/// How the node is watched. A device that sends heartbeats answers no guard requests (CiA 301, 7.2.8.2.2; R-DST-063).
+fn kind(problems: &mut Problems, context: &Context<'_>) -> ErrorControlWord {
+    let (file, entry) = (&context.file.error_control, context.entry);
+    let kind = entry.error_control.as_ref().map_or(file.kind, |at| at.value);
+    if kind == ErrorControlWord::Guarding
+        && let Some(heartbeat) = &file.heartbeat_ms
+    {
+        let at = entry.error_control.as_ref().map(|at| (context.config, &at.span));
+        let (source, span) = at.unwrap_or((context.source, &heartbeat.span));
+        let message = "the device is told to send heartbeats and cannot be guarded as well";
+        problems.error(source, span, message, "use `heartbeat`, or take `heartbeat_ms` out of the mapping");
+    }
+    kind
 }
 
 fn byte(number: Option<u64>, default: u8) -> u8 {
