@@ -6,7 +6,7 @@
 //!
 //! A node that does not answer is asked again and again, ever more seldom, and at once when it gives a sign of life
 //! (R-DST-052, R-DST-053). Nothing here resets a node. To change the mapping of a PDO the node has to be pre-operational
-//! (R-DST-023): one that is operational is put there first, and only if there is something to change.
+//! (R-DST-023): one that is not known to be is put there first, and only if there is something to change.
 //!
 //! - this file: the way through the steps, repetition, what is told.
 //! - `task`: one step each, from answer to answer. `pdo`: the step that reads or changes a PDO.
@@ -50,8 +50,8 @@ pub(super) struct Boot {
     failures: u32,
     /// The failure that was told last, until the boot succeeds.
     told: Option<BootFailure>,
-    /// The node reports operational.
-    operational: bool,
+    /// The node is not known to be pre-operational.
+    may_run: bool,
     outputs: VecDeque<BootOutput>,
 }
 
@@ -93,7 +93,7 @@ impl Boot {
             written: 0,
             failures: 0,
             told: None,
-            operational: false,
+            may_run: true,
             outputs: VecDeque::new(),
         }
     }
@@ -110,7 +110,6 @@ impl Boot {
 
     /// The node booted: everything anew.
     pub(super) fn handle_boot_up(&mut self, now: Instant) {
-        self.operational = false;
         self.failures = 0;
         self.restart(now + SETTLE);
     }
@@ -152,9 +151,9 @@ impl Boot {
         }
     }
 
-    /// The node reports, or is believed to be in, operational or another state.
-    pub(super) fn handle_state(&mut self, operational: bool) {
-        self.operational = operational;
+    /// The node reports a state, or is believed to be in it. `may_run`: another one than pre-operational.
+    pub(super) fn handle_state(&mut self, may_run: bool) {
+        self.may_run = may_run;
     }
 
     /// The bus cannot be used.
@@ -162,6 +161,7 @@ impl Boot {
         if !self.is_empty() {
             self.phase = Phase::Paused;
             self.task = None;
+            self.may_run = true;
         }
     }
 
@@ -205,7 +205,7 @@ impl Boot {
                 self.next_step(now);
             }
             Phase::Settling(at) if at <= now => {
-                self.operational = false;
+                self.may_run = false;
                 self.phase = Phase::Running;
                 self.advance(now, None);
             }
@@ -256,7 +256,7 @@ impl Boot {
         let mut answer = answer;
         loop {
             let Some(task) = &mut self.task else { return };
-            match task.advance(answer.take(), self.operational) {
+            match task.advance(answer.take(), self.may_run) {
                 Advance::Ask(request) => {
                     let id = self.transfer();
                     self.outputs.push_back(BootOutput::Sdo(id, request.for_boot()));

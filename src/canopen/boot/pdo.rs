@@ -77,12 +77,12 @@ impl PdoTask {
         }
     }
 
-    pub(super) fn advance(&mut self, answer: Answer, operational: bool) -> Advance {
+    pub(super) fn advance(&mut self, answer: Answer, may_run: bool) -> Advance {
         match (self.phase, answer) {
             (Phase::Begin, _) => self.read(Phase::Parameter(1)),
             (Phase::Parameter(sub), Some(answer)) => self.parameter(sub, answer),
-            (Phase::Count, Some(answer)) => self.count(answer, operational),
-            (Phase::Entry(entry), Some(answer)) => self.entry(entry, answer, operational),
+            (Phase::Count, Some(answer)) => self.count(answer, may_run),
+            (Phase::Entry(entry), Some(answer)) => self.entry(entry, answer, may_run),
             (Phase::Write, Some(Ok(_))) => {
                 self.phase = Phase::Wrote;
                 Advance::Wrote(self.asked)
@@ -147,7 +147,7 @@ impl PdoTask {
         }
     }
 
-    fn count(&mut self, answer: Result<Vec<u8>, SdoError>, operational: bool) -> Advance {
+    fn count(&mut self, answer: Result<Vec<u8>, SdoError>, may_run: bool) -> Advance {
         let count = match answer.map(|data| number(self.asked, &data)) {
             Ok(Ok(count)) => u8::try_from(count).unwrap_or(u8::MAX),
             Ok(Err(failure)) => return Advance::Failed(failure),
@@ -156,24 +156,20 @@ impl PdoTask {
         self.found.count = count;
         self.found.maps.clear();
         // 254 and 255 are multiplexed PDOs, which carry no fixed content.
-        if count == 0 || count > MOST_ENTRIES {
-            self.compare(operational)
-        } else {
-            self.read(Phase::Entry(1))
-        }
+        if count == 0 || count > MOST_ENTRIES { self.compare(may_run) } else { self.read(Phase::Entry(1)) }
     }
 
-    fn entry(&mut self, entry: u8, answer: Result<Vec<u8>, SdoError>, operational: bool) -> Advance {
+    fn entry(&mut self, entry: u8, answer: Result<Vec<u8>, SdoError>, may_run: bool) -> Advance {
         match answer.map(|data| number(self.asked, &data)) {
             Ok(Ok(value)) => self.found.maps.push(MappedObject::from_entry(value)),
             Ok(Err(failure)) => return Advance::Failed(failure),
             Err(error) => return Advance::failed(self.asked, error),
         }
-        if entry < self.found.count { self.read(Phase::Entry(entry + 1)) } else { self.compare(operational) }
+        if entry < self.found.count { self.read(Phase::Entry(entry + 1)) } else { self.compare(may_run) }
     }
 
     /// Everything is read.
-    fn compare(&mut self, operational: bool) -> Advance {
+    fn compare(&mut self, may_run: bool) -> Advance {
         self.writes = self.differences();
         if self.writes.is_empty() || matches!(self.setup.mode, MappingMode::Adopt { .. }) {
             return self.tell();
@@ -190,7 +186,7 @@ impl PdoTask {
             return Advance::Failed(BootFailure::NotKept { object });
         }
         self.phase = Phase::Write;
-        if operational { Advance::EnterPreOperational } else { self.write() }
+        if may_run { Advance::EnterPreOperational } else { self.write() }
     }
 
     /// What has to be written, the first one last.

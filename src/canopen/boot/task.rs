@@ -98,12 +98,12 @@ impl Task {
     }
 
     /// Goes on.
-    pub(super) fn advance(&mut self, answer: Answer, operational: bool) -> Advance {
+    pub(super) fn advance(&mut self, answer: Answer, may_run: bool) -> Advance {
         match self {
             Self::Identity { object, expected } => identity(*object, *expected, answer),
             Self::Read { object, told } => read(*object, told, answer),
             Self::Write(write) => write.advance(answer),
-            Self::Pdo(task) => task.advance(answer, operational),
+            Self::Pdo(task) => task.advance(answer, may_run),
             Self::Save { needed } => match answer {
                 None if *needed => Advance::Ask(SdoRequest::write(STORE, SAVE.to_vec())),
                 None | Some(Ok(_)) => Advance::Done,

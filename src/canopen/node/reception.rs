@@ -197,7 +197,11 @@ impl Node {
 
     fn set_state(&mut self, to: NmtState, ordered: bool, outputs: &mut Outputs) {
         let from = self.state.replace(to);
-        self.boot.handle_state(to == NmtState::Operational);
+        self.boot.handle_state(match to {
+            NmtState::Initialising => self.self_starting,
+            NmtState::PreOperational => false,
+            NmtState::Operational | NmtState::Stopped => true,
+        });
         if from != Some(to) {
             if !ordered {
                 self.ordered = None;

@@ -141,5 +141,6 @@ impl Node {
         outputs.transmit(request.frame(Some(self.id)));
         self.note_sent(now, request, outputs);
         self.state = Some(NmtState::PreOperational);
+        self.boot.handle_state(false);
     }
 }
