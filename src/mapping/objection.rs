@@ -10,6 +10,8 @@ pub enum Objection {
     Quality(Reason),
     /// Its own device says that it means nothing: the tag that tells so is good and false (R-DET-086).
     NotValid,
+    /// Its own device has a reservation, such as a value outside its range (R-DST-026).
+    Doubtful,
 }
 
 impl Objection {
@@ -19,6 +21,7 @@ impl Objection {
         match self {
             Self::Quality(reason) => reason.word(),
             Self::NotValid => "not_valid",
+            Self::Doubtful => "doubtful",
         }
     }
 }
@@ -27,7 +30,15 @@ impl TagDef {
     /// What is to be said against a sample of this tag; `None` for one that is good and that its device vouches for.
     #[must_use]
     pub fn objection(&self, image: &ProcessImage, sample: &Sample) -> Option<Objection> {
-        sample.quality.reason().map(Objection::Quality).or_else(|| self.disowned(image))
+        let own = sample.quality.reason().map(Objection::Quality);
+        own.or_else(|| self.disowned(image)).or_else(|| self.doubted(image))
+    }
+
+    /// What its device says against the value, or that what would say so cannot be trusted.
+    fn doubted(&self, image: &ProcessImage) -> Option<Objection> {
+        let doubt = image.tag(self.doubtful?);
+        let unknown = doubt.quality.reason().map(Objection::Quality);
+        unknown.or_else(|| doubt.value.is_true().then_some(Objection::Doubtful))
     }
 
     /// Why its device does not vouch for the value, whatever its own quality.

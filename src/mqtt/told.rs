@@ -34,10 +34,11 @@ impl NodeState {
     }
 }
 
-/// Of each tag: whether it is published, or tells whether a published one means anything.
+/// Of each tag: whether it is published, or tells whether a published one means anything or is doubtful.
 pub(super) fn watched(table: &TagTable) -> Vec<bool> {
     let mut watched: Vec<bool> = table.tags.iter().map(|tag| tag.published).collect();
-    for validity in table.tags.iter().filter(|tag| tag.published).filter_map(|tag| tag.valid) {
+    let published = table.tags.iter().filter(|tag| tag.published);
+    for validity in published.flat_map(|tag| tag.valid.into_iter().chain(tag.doubtful)) {
         if let Some(watched) = watched.get_mut(validity.0) {
             *watched = true;
         }

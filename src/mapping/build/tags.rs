@@ -111,7 +111,7 @@ pub fn tags(problems: &mut Problems, context: &Context<'_>) -> (Vec<TagDef>, Vec
         let mut moved = |index: &mut TagIndex| {
             index.0 = context.base + places.get(index.0).copied().unwrap_or_default();
         };
-        tag.valid.iter_mut().for_each(&mut moved);
+        tag.valid.iter_mut().chain(&mut tag.doubtful).for_each(&mut moved);
         if let Source::Derived(derived) = &mut tag.source {
             derived.for_each_input_mut(&mut moved);
         }
@@ -180,6 +180,7 @@ fn parameter(
         decimals: 0,
         source: Source::Derived(Derived::Constant { value: value.value }),
         valid: None,
+        doubtful: None,
         registers: Vec::new(),
         published: false,
         deadband: 0.0,
@@ -297,6 +298,7 @@ fn finished(
         decimals: decimals.and_then(|decimals| u8::try_from(decimals).ok()).unwrap_or(usual_decimals),
         source,
         valid: keys.valid.and_then(|valid| context.bool_tag(problems, valid, &item.element, "`valid`")),
+        doubtful: keys.doubtful.and_then(|tag| context.bool_tag(problems, tag, &item.element, "`doubtful`")),
         registers: places(problems, context, item, keys),
         published: keys.publish.unwrap_or(true),
         deadband: deadband.map_or(0.0, |(_, value)| value.value),

@@ -37,6 +37,8 @@ macro_rules! tag_entry {
             pub deadband: Option<At<f64>>,
             /// A bool tag that tells whether the value means anything.
             pub valid: Option<At<String>>,
+            /// A bool tag that is true while the value is to be used with a reservation, such as outside its range.
+            pub doubtful: Option<At<String>>,
             /// Part of the MQTT state message. Default: true.
             pub publish: Option<bool>,
             /// Where it stands in the register map.
@@ -58,6 +60,7 @@ macro_rules! tag_entry {
                     decimals: self.decimals.as_ref(),
                     deadband: self.deadband.as_ref(),
                     valid: self.valid.as_ref(),
+                    doubtful: self.doubtful.as_ref(),
                     publish: self.publish,
                     registers: &self.registers,
                     bit_address: self.bit_address.as_ref(),
@@ -80,6 +83,8 @@ pub struct SharedKeys<'a> {
     pub deadband: Option<&'a At<f64>>,
     /// A bool tag that tells whether the value means anything.
     pub valid: Option<&'a At<String>>,
+    /// A bool tag that is true while the value is to be used with a reservation.
+    pub doubtful: Option<&'a At<String>>,
     /// Part of the MQTT state message.
     pub publish: Option<bool>,
     /// Where it stands in the register map.

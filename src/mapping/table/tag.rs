@@ -26,6 +26,8 @@ pub struct TagDef {
     pub source: Source,
     /// A bool tag of the same node that tells whether the value means anything (R-DET-086).
     pub valid: Option<TagIndex>,
+    /// A bool tag of the same node that is true while the value is to be used with a reservation (R-DST-026).
+    pub doubtful: Option<TagIndex>,
     /// Where it stands in the register map of its unit, offset not yet added.
     pub registers: Vec<RegisterDef>,
     /// Whether it is part of the MQTT state payload.
