@@ -17,6 +17,9 @@
 //! | `lifecycle` | the program as a process: start, stop, exit codes |
 //! | `properties` | random input: no panic, no torn value |
 //! | `documents` | the documents against the program: alarms, keys, commands, names of tests |
+//! | `transmitter` | the gateway with the shipped mapping of the DST P92C against the simulated one |
+//! | `transmitter_frames` | the worked frames of that device, decoded |
+//! | `transmitter_rules` | what the gateway does with it, requirement by requirement |
 //! | `requirements` | every requirement has a test whose name cites it, or a reason |
 //!
 //! Tests on a real CAN bus are in `tests/vcan`, those of the container in `tests/container`.
@@ -56,5 +59,7 @@ mod properties;
 mod requirements;
 mod support;
 mod transmitter;
+mod transmitter_frames;
+mod transmitter_rules;
 mod units;
 mod web_server;

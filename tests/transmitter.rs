@@ -64,7 +64,7 @@ fn r_dst_001_024_057_061_a_transmitter_as_shipped_is_configured_started_and_read
 }
 
 #[test]
-fn r_dst_028_036_the_pressure_is_in_bar_whatever_the_device_was_set_to() {
+fn r_dst_028_the_pressure_is_in_bar_whatever_the_device_was_set_to() {
     let mut world = running();
     world.order("node 2 pressure 123.4");
     world.run_for(3000);

@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn r_det_089_the_default_bit_rate_of_a_serial_adapter_is_125_kbit_per_second() {
+    fn r_det_089_r_dst_002_the_default_bit_rate_of_a_serial_adapter_is_125_kbit_per_second() {
         let Interface::Slcan { bit_rate, .. } = read("slcan:/dev/ttyACM0") else { panic!("not slcan") };
         assert_eq!(bit_rate, 125_000);
     }

@@ -64,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn r_det_005_node_ids_are_1_to_127() {
+    fn r_det_005_r_dst_003_120_node_ids_are_1_to_127() {
         let valid: Vec<u8> = (0..=255).filter(|id| NodeId::new(*id).is_some()).collect();
         assert_eq!(valid, (1..=127).collect::<Vec<u8>>());
     }

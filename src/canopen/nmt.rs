@@ -107,12 +107,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn v_det_01_r_det_007_to_010_start_and_stop_addressed_and_broadcast() {
+    fn v_det_01_r_det_007_to_010_r_dst_054_055_056_start_stop_and_reset_addressed_and_broadcast() {
         let node = NodeId::new(1);
         assert_eq!(NmtRequest::Start.frame(node).to_string(), "000#0101");
         assert_eq!(NmtRequest::Start.frame(None).to_string(), "000#0100");
         assert_eq!(NmtRequest::Stop.frame(node).to_string(), "000#0201");
         assert_eq!(NmtRequest::Stop.frame(None).to_string(), "000#0200");
         assert_eq!(NmtRequest::Start.frame(NodeId::new(127)).to_string(), "000#017F");
+        assert_eq!(NmtRequest::ResetNode.frame(node).to_string(), "000#8101");
     }
 }

@@ -125,7 +125,7 @@ fn a_detcon_that_shares_the_node_id_runs_on_and_the_moved_device_waits() {
 }
 
 #[test]
-fn r_dst_114_a_new_bit_rate_waits_for_the_device_to_be_switched_off_and_on() {
+fn r_dst_112_114_a_new_bit_rate_waits_for_the_device_to_be_switched_off_and_on() {
     let words = "set-node-id --to 5 --bit-rate 250 --only-one-device";
     let (sent, outcome) = run(words, &dst(), &[]);
     assert_eq!(outcome, Ok(vec![LssAnswer::Changed { active: false, restored: true }]));
@@ -137,6 +137,8 @@ fn r_dst_114_a_new_bit_rate_waits_for_the_device_to_be_switched_off_and_on() {
         "nothing is activated"
     );
     assert_eq!(sent[0], "000#0200", "the manual's example stops all nodes");
+    let lines = told(&arguments(words).command, &outcome.unwrap());
+    assert!(lines[0].contains("all other devices and this host's interface must follow"), "{lines:?}");
 }
 
 #[test]

@@ -259,6 +259,23 @@ mod tests {
         assert_eq!(told(&action, &[]).unwrap(), "0x1017:0 is written: 500");
     }
 
+    /// What the documents say on a node id that is written by SDO; then comes `cangate nmt reset-node`.
+    #[tokio::test(start_paused = true)]
+    async fn v_dst_18_r_dst_011_117_118_120_node_id_and_bit_rate_are_written_and_saved() {
+        for (bus, object, value, data_type, request, answer) in [
+            ("sdo-node", "0x4F01:0", "5", Some(DataType::U8), "601#2F014F0005000000", "581#60014F0000000000"),
+            ("sdo-rate", "0x4F00:0", "3", Some(DataType::U8), "601#2F004F0003000000", "581#60004F0000000000"),
+            ("sdo-save", "0x1010:1", "0x65766173", None, "601#2310100173617665", "581#6010100100000000"),
+        ] {
+            let answers = Box::leak(Box::new([(request, answer)]));
+            assert_eq!(ask(bus, answers, &write(object, value, data_type)).await, Ok(vec![]), "{object}");
+        }
+        let refused = write("0x4F01:0", "128", Some(DataType::U8));
+        let answers = &[("601#2F014F0080000000", "581#80014F0030000906")];
+        let error = ask("sdo-range", answers, &refused).await.unwrap_err().to_string();
+        assert!(error.contains("0x06090030"), "{error}");
+    }
+
     #[tokio::test(start_paused = true)]
     async fn r_dst_068_an_abort_is_told_by_code_and_name() {
         let action = read("0x2000:0", None);

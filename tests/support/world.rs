@@ -45,6 +45,7 @@ impl Default for Weather {
 enum Sender {
     Gateway,
     Device(usize),
+    Stranger,
 }
 
 /// The bus, who is on it, and the time.
@@ -61,6 +62,8 @@ pub struct World {
     now: Instant,
     /// What the gateway sent, without repetitions.
     pub sent: BTreeSet<String>,
+    /// Everything that was sent on the bus in its order, by whom ever, once a test asks for it with `Some`.
+    pub log: Option<Vec<String>>,
     /// Names of all alarms that an operator was called by, whether they still hold or not.
     pub raised: BTreeSet<String>,
     /// The last event that was looked at.
@@ -87,6 +90,7 @@ impl World {
             random: Random::new(seed),
             now: Instant::START,
             sent: BTreeSet::new(),
+            log: None,
             raised: BTreeSet::new(),
             cursor: 0,
         }
@@ -149,6 +153,13 @@ impl World {
         self.settle();
     }
 
+    /// Somebody else sends a frame now, to everybody.
+    pub fn say(&mut self, frame: &str) {
+        let (now, frame) = (self.now(), frame.parse().unwrap());
+        self.deliver(now, Sender::Stranger, frame);
+        self.settle();
+    }
+
     /// Lets time pass.
     pub fn run_for(&mut self, millis: u64) {
         let end = self.now + Duration::from_millis(millis);
@@ -206,7 +217,7 @@ impl World {
                 device.handle_frame(now, &frame);
             }
         }
-        if let (Some(gateway), Sender::Device(_)) = (&mut self.gateway, sender) {
+        if let (Some(gateway), Sender::Device(_) | Sender::Stranger) = (&mut self.gateway, sender) {
             let event = BusEvent::Frame { frame, at: now };
             gateway.handle_input(now, Input::Bus { bus: BUS, event });
             // Frames are worked off one by one, as the task does.
@@ -246,6 +257,9 @@ impl World {
     }
 
     fn send(&mut self, sender: Sender, frame: CanFrame) {
+        if let Some(log) = &mut self.log {
+            log.push(frame.to_string());
+        }
         let copies = if self.random.between(0, 999) < self.weather.lost {
             0
         } else if self.random.between(0, 999) < self.weather.doubled {

@@ -215,7 +215,7 @@ fn v_det_16_highest_node_id() {
 }
 
 #[test]
-fn v_det_17_r_det_006_and_042_frames_that_must_not_be_decoded() {
+fn v_det_17_r_det_006_042_r_dst_005_frames_that_must_not_be_decoded() {
     let mut bench = running();
     bench.frames(&[
         (1, "00000181#0102030405060708"),

@@ -34,6 +34,16 @@ fn r_dst_091_r_dst_099_v_dst_19_switch_selective_is_four_frames_and_one_answer()
 }
 
 #[test]
+fn r_dst_097_switch_global_is_one_frame_for_all_and_not_answered() {
+    for (state, frame) in
+        [(LssState::Configuration, "7E5#0401000000000000"), (LssState::Waiting, "7E5#0400000000000000")]
+    {
+        let mut script = script();
+        assert_eq!(script.begin(LssJob::SwitchGlobal { state, only_slave: true }), [frame, "Done"]);
+    }
+}
+
+#[test]
 fn r_dst_095_r_dst_104_v_dst_19_inquire_address() {
     let mut script = configuring();
     assert_eq!(script.begin(LssJob::InquireAddress), ["7E5#5A00000000000000"]);
@@ -72,7 +82,7 @@ fn r_dst_100_r_dst_120_v_dst_19_configure_node_id_and_its_refusal() {
 }
 
 #[test]
-fn r_dst_101_r_dst_116_v_dst_19_configure_bit_rate_by_the_standard_table() {
+fn r_dst_007_101_116_v_dst_19_configure_bit_rate_by_the_standard_table() {
     let mut script = configuring();
     let rate = LssBitRate::from_kbit(250).unwrap();
     assert_eq!(script.begin(LssJob::ConfigureBitRate(rate)), ["7E5#1300030000000000"]);
