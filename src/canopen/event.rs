@@ -171,11 +171,16 @@ pub enum NodeEvent {
         /// Manufacturer bytes.
         vendor: [u8; 5],
     },
-    /// Two nodes seem to share this id: TPDOs far too often, a boot-up message while TPDOs go on, or three guard requests
-    /// in a row answered twice.
+    /// Two nodes seem to share this id; told once for each kind of evidence until `DuplicateCleared`.
     DuplicateSuspected {
         /// What was seen.
         evidence: &'static str,
+    },
+    /// The frames of this TPDO come with two lengths: those that have not the right one are discarded, and the others are
+    /// the node's own. Until `DuplicateCleared`.
+    DuplicateToldApart {
+        /// Which.
+        pdo: PdoIndex,
     },
     /// Nothing suspicious for 30 s after `DuplicateSuspected`.
     DuplicateCleared,

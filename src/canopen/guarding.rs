@@ -79,6 +79,8 @@ pub(super) enum Verdict {
         foreign: bool,
         /// Our request had been answered already.
         twice: bool,
+        /// That was too long ago for this to be an answer as well, and no other request followed.
+        unasked: bool,
     },
 }
 
@@ -136,12 +138,14 @@ impl Guarding {
             return self.judge(toggle);
         }
         let foreign = self.foreign.take().is_some_and(|until| now <= until);
-        let twice = !foreign && self.answered.is_some_and(|deadline| now <= deadline);
+        let answered = self.answered.filter(|_| !foreign);
+        let twice = answered.is_some_and(|deadline| now <= deadline);
+        let unasked = answered.is_some() && !twice;
         self.alive();
         if self.settings.toggle_resync {
             self.reference = Some(toggle);
         }
-        Verdict::Unsolicited { foreign, twice }
+        Verdict::Unsolicited { foreign, twice, unasked }
     }
 
     /// The answer to a request of ours.

@@ -69,6 +69,11 @@ impl Pdos {
         self.pdos.get(index.0).is_some_and(|pdo| pdo.settings.synchronous)
     }
 
+    /// How many bytes it has.
+    pub(super) fn length(&self, index: PdoIndex) -> Option<u8> {
+        self.pdos.get(index.0).map(|pdo| pdo.settings.length)
+    }
+
     /// A frame of this length came. A discarded one does not count as received. `None`: there is no such TPDO.
     pub(super) fn receive(&mut self, now: Instant, index: PdoIndex, dlc: u8) -> Option<Length> {
         let pdo = self.pdos.get_mut(index.0)?;

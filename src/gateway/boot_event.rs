@@ -214,7 +214,7 @@ impl Gateway {
         let length = def.canopen.polls.get(poll).map_or(0, |poll| poll.length);
         let object = def.canopen.polls.get(poll).map(|poll| poll.object);
         if let Some(data) = result.as_ref().ok().filter(|data| data.len() >= length) {
-            let quality = node.quality_of_new_data(false);
+            let quality = node.quality_of_new_data(false, false);
             self.tags.apply(&self.table, now, (index, carrier), data, quality);
             if let Some(object) = object {
                 self.learn(at, object, Some(data));

@@ -31,7 +31,8 @@ pub(super) struct Node {
     pub(super) ever_seen: bool,
     /// The journal tells that it was lost.
     pub(super) told_lost: bool,
-    pub(super) duplicate: bool,
+    /// What says that another node has the same id.
+    pub(super) duplicate: Option<&'static str>,
     /// It told its state since it was lost or the bus could not be used.
     pub(super) supervised: bool,
     /// Somebody else guards it too.
@@ -66,6 +67,8 @@ pub(super) struct PdoWatch {
     pub(super) reserved: u64,
     /// That it is too long has been told.
     pub(super) told_too_long: bool,
+    /// Two nodes send it, but with different lengths: only one's frames count.
+    pub(super) told_apart: bool,
 }
 
 /// Why a node cannot be booted.
@@ -107,7 +110,7 @@ impl Node {
             boot_trouble: None,
             ever_seen: false,
             told_lost: false,
-            duplicate: false,
+            duplicate: None,
             supervised: false,
             foreign_guard: false,
             last_toggle_error: None,
@@ -129,13 +132,13 @@ impl Node {
     }
 
     /// How far data that comes now can be trusted (R-DET-037, P22). `too_late`: its bus is known to be down, so that it
-    /// was on its way before.
-    pub(super) fn quality_of_new_data(&self, too_late: bool) -> Quality {
+    /// was on its way before. `told_apart`: it is this node's even if another has the same id.
+    pub(super) fn quality_of_new_data(&self, too_late: bool, told_apart: bool) -> Quality {
         if too_late {
             Quality::Uncertain(Reason::BusUnavailable)
         } else if self.lost.is_some() {
             Quality::Uncertain(Reason::NodeLost)
-        } else if self.duplicate {
+        } else if self.duplicate.is_some() && !told_apart {
             Quality::Uncertain(Reason::DuplicateNode)
         } else {
             Quality::Good
@@ -250,7 +253,10 @@ impl Node {
         if !stale.is_empty() {
             return format!("does not come: {}", stale.join(", "));
         }
-        if self.duplicate { format!("two nodes seem to share the node id {id}") } else { String::new() }
+        match self.duplicate {
+            Some(evidence) => format!("two devices seem to share node id {id}: {evidence}"),
+            None => String::new(),
+        }
     }
 }
 
@@ -282,7 +288,7 @@ impl Gateway {
         let (lost, never_seen) = (node.lost.is_some() && node.ever_seen, node.never_seen);
         let boot_failed = node.contact && node.boot_trouble.is_some();
         let start_failed = node.start_failed.is_some() || node.start_held_back || boot_failed;
-        let (duplicate, foreign_guard) = (node.duplicate, node.foreign_guard);
+        let (duplicate, foreign_guard) = (node.duplicate.is_some(), node.foreign_guard);
         self.raise(now, owner, BuiltIn::NodeLost, lost, undecided_until);
         self.raise(now, owner, BuiltIn::NodeNeverSeen, never_seen, undecided_until);
         self.conditions.set(now, owner, BuiltIn::NotOperational, start_failed);

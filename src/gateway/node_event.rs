@@ -73,8 +73,12 @@ impl Gateway {
                 });
             }
             NodeEvent::DuplicateSuspected { evidence } => self.duplicate_suspected(at, evidence),
+            NodeEvent::DuplicateToldApart { pdo } => self.told_apart(at, pdo),
             NodeEvent::DuplicateCleared => {
-                self.change(index, |node| node.duplicate = false);
+                self.change(index, |node| {
+                    node.duplicate = None;
+                    node.watches.iter_mut().for_each(|watch| watch.told_apart = false);
+                });
                 self.tell(at, "duplicate_node_cleared", |_| ());
             }
             NodeEvent::NmtSent { request } => self.nmt_sent(at, request),
@@ -119,7 +123,8 @@ impl Gateway {
         let Some(def) = self.table.nodes.get(index.0) else { return };
         let too_late = self.comes_too_late(def.bus);
         let Some(node) = self.nodes.get_mut(index.0) else { return };
-        let quality = node.quality_of_new_data(too_late);
+        let told_apart = node.watches.get(pdo.0).is_some_and(|watch| watch.told_apart);
+        let quality = node.quality_of_new_data(too_late, told_apart);
         let (Some(status), Some(watch)) = (node.status.pdos.get_mut(pdo.0), node.watches.get_mut(pdo.0))
         else {
             return;
@@ -364,9 +369,25 @@ impl Gateway {
     }
 
     fn duplicate_suspected(&mut self, at: (Now, NodeIndex), evidence: &'static str) {
-        self.change(at.1, |node| node.duplicate = true);
-        self.degrade(at.0, at.1, None, Quality::Uncertain(Reason::DuplicateNode));
+        let mut first = false;
+        self.change(at.1, |node| first = node.duplicate.replace(evidence).is_none());
+        if first {
+            self.degrade(at.0, at.1, None, Quality::Uncertain(Reason::DuplicateNode));
+        }
         self.tell(at, "duplicate_node", |event| evidence.clone_into(&mut event.text));
+    }
+
+    /// Two nodes send this TPDO, but only one of them with the right length. What came before may have been the other's.
+    fn told_apart(&mut self, at: (Now, NodeIndex), pdo: PdoIndex) {
+        self.change(at.1, |node| {
+            if let Some(watch) = node.watches.get_mut(pdo.0) {
+                watch.told_apart = true;
+            }
+        });
+        let number = self.pdo_number(at.1, pdo);
+        self.tell(at, "duplicate_told_apart", |event| {
+            event.text = format!("frames of TPDO{number} that have another length than the mapping says are ignored");
+        });
     }
 
     fn nmt_sent(&mut self, at: (Now, NodeIndex), request: NmtRequest) {

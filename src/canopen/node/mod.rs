@@ -61,6 +61,8 @@ pub(super) struct Node {
     pub(super) unsolicited_told: bool,
     /// It told its state since it was lost or the bus could not be used.
     pub(super) supervised: bool,
+    /// Somebody else's last guard request was not answered yet.
+    pub(super) overheard_request: bool,
     /// Until then somebody else is known to guard this node.
     pub(super) foreign_guard_until: Option<Instant>,
     pub(super) seen: bool,
@@ -109,6 +111,7 @@ impl Node {
             invalid: None,
             unsolicited_told: false,
             supervised: false,
+            overheard_request: false,
             foreign_guard_until: None,
             seen: false,
             never_seen_after: settings.never_seen_after,
@@ -304,7 +307,9 @@ impl Node {
             self.foreign_guard_until = None;
             outputs.node(self.id, NodeEvent::ForeignGuardMasterGone);
         }
-        if self.duplicate.handle_timeout(now) {
+        let (evidence, cleared) = self.duplicate.handle_timeout(now);
+        self.suspect(evidence, outputs);
+        if cleared {
             outputs.node(self.id, NodeEvent::DuplicateCleared);
         }
         if self.never_seen_at.is_some_and(|at| at <= now) {

@@ -4,6 +4,7 @@
 
 use std::time::Duration;
 
+use super::super::duplicate::StateKind;
 use super::super::guarding::Verdict;
 use super::super::outputs::Outputs;
 use super::super::pdo::Length;
@@ -16,6 +17,8 @@ use crate::time::Instant;
 
 /// Another guarding master has gone after this long without a request of it.
 const FOREIGN_GUARD_QUIET: Duration = Duration::from_secs(60);
+/// EMCY: transmit COB-ID collision (CiA 301).
+const COLLISION: u16 = 0x8150;
 
 impl Node {
     /// A frame on `0x700 + id`.
@@ -35,13 +38,17 @@ impl Node {
         }
         match frame.data().first() {
             None => false,
-            Some(0) => self.boot_up(now, outputs),
-            Some(&byte) => self.state_frame(now, byte & 0x80 != 0, byte & 0x7F, outputs),
+            Some(0) => {
+                let asked = std::mem::take(&mut self.overheard_request);
+                self.boot_up(now, !asked, outputs)
+            }
+            Some(&byte) => self.state_frame(now, byte, outputs),
         }
     }
 
     /// A guard request that we did not send (R-DET-043). In the passive role that is another's business.
     fn guard_request(&mut self, now: Instant, outputs: &mut Outputs) {
+        self.overheard_request = true;
         if self.start.is_none() {
             return;
         }
@@ -54,8 +61,9 @@ impl Node {
     }
 
     /// A state frame `00`: a boot-up message, or a reply of a node that is still initialising with toggle bit 0; the two
-    /// look the same (R-DET-029, R-DET-034, R-DET-039).
-    fn boot_up(&mut self, now: Instant, outputs: &mut Outputs) -> bool {
+    /// look the same (R-DET-029, R-DET-034, R-DET-039). `single`: it can be no reply to somebody else, nor one of two that
+    /// a device sends for one boot.
+    fn boot_up(&mut self, now: Instant, single: bool, outputs: &mut Outputs) -> bool {
         let initialising = self.state == Some(NmtState::Initialising);
         let (recovered, reply) = match &mut self.watch {
             Watch::Guarding(guarding) => guarding.handle_zero(),
@@ -73,6 +81,9 @@ impl Node {
         }
         self.duplicate.handle_boot_up(now, self.self_starting);
         let expected = self.reset_until.take().is_some_and(|until| now <= until);
+        if single && !reply {
+            self.duplicate.count_boot_up(now, expected);
+        }
         let was_running = self.state.is_some() && !initialising;
         if was_running && !expected {
             outputs.node(self.id, NodeEvent::Restarted);
@@ -96,7 +107,13 @@ impl Node {
     }
 
     /// A state frame other than `00`.
-    fn state_frame(&mut self, now: Instant, toggle: bool, code: u8, outputs: &mut Outputs) -> bool {
+    fn state_frame(&mut self, now: Instant, byte: u8, outputs: &mut Outputs) -> bool {
+        let (toggle, code) = (byte & 0x80 != 0, byte & 0x7F);
+        let asked = std::mem::take(&mut self.overheard_request);
+        if !matches!(self.watch, Watch::Guarding(_)) {
+            let kind = if asked { StateKind::Reply } else { StateKind::Heartbeat };
+            self.compare(now, (asked == toggle).then_some(kind), outputs);
+        }
         let recovered = match &mut self.watch {
             Watch::Guarding(guarding) => {
                 let missed = guarding.expire(now);
@@ -104,7 +121,8 @@ impl Node {
                 if let Some(failure) = missed {
                     self.missed(failure, outputs);
                 }
-                match self.weigh(now, verdict, outputs) {
+                self.compare(now, kind_of(verdict, toggle), outputs);
+                match self.weigh(now, verdict, byte, outputs) {
                     Some(recovered) => recovered,
                     None => return false,
                 }
@@ -130,32 +148,52 @@ impl Node {
     }
 
     /// Tells what a guard reply was; `None` where its state does not count, else whether it ended the loss.
-    fn weigh(&mut self, now: Instant, verdict: Verdict, outputs: &mut Outputs) -> Option<bool> {
+    fn weigh(
+        &mut self,
+        now: Instant,
+        verdict: Verdict,
+        byte: u8,
+        outputs: &mut Outputs,
+    ) -> Option<bool> {
         match verdict {
             Verdict::Valid { recovered, wrong_toggle } => {
-                self.duplicate.handle_reply();
+                self.duplicate.handle_reply(byte);
                 if let Some(consecutive) = wrong_toggle {
                     outputs.node(self.id, NodeEvent::ToggleError { consecutive });
                 }
                 Some(recovered)
             }
             Verdict::ToggleError(failure) => {
-                self.duplicate.handle_reply();
+                self.duplicate.handle_reply(byte);
                 outputs.node(self.id, NodeEvent::ToggleError { consecutive: failure.consecutive });
                 if let Some(stuck_toggle) = failure.lost {
                     self.lost(stuck_toggle, outputs);
                 }
                 None
             }
-            Verdict::Unsolicited { foreign, twice } => {
-                if twice && let Some(evidence) = self.duplicate.handle_second_reply(now) {
-                    outputs.node(self.id, NodeEvent::DuplicateSuspected { evidence });
+            Verdict::Unsolicited { foreign, twice, .. } => {
+                if twice {
+                    let evidence = self.duplicate.handle_second_reply(now, byte);
+                    self.suspect(evidence, outputs);
                 }
                 if !foreign && !std::mem::replace(&mut self.unsolicited_told, true) {
                     outputs.node(self.id, NodeEvent::UnsolicitedState);
                 }
                 Some(false)
             }
+        }
+    }
+
+    /// A heartbeat, or the answer to a guard request, where it can be told which.
+    fn compare(&mut self, now: Instant, kind: Option<StateKind>, outputs: &mut Outputs) {
+        let evidence = kind.and_then(|kind| self.duplicate.handle_state(now, kind));
+        self.suspect(evidence, outputs);
+    }
+
+    /// Tells new evidence that another node has the same id.
+    pub(super) fn suspect(&self, evidence: Option<&'static str>, outputs: &mut Outputs) {
+        if let Some(evidence) = evidence {
+            outputs.node(self.id, NodeEvent::DuplicateSuspected { evidence });
         }
     }
 
@@ -233,7 +271,18 @@ impl Node {
         }
         self.frame_seen(now, outputs);
         let received = frame.dlc();
-        let length = self.pdos.receive(now, pdo, received);
+        let apart = self.duplicate.tells_apart(pdo);
+        let evidence = self.duplicate.handle_length(now, pdo, received);
+        self.suspect(evidence, outputs);
+        if !apart && self.duplicate.tells_apart(pdo) {
+            outputs.node(self.id, NodeEvent::DuplicateToldApart { pdo });
+        }
+        let length = if self.duplicate.tells_apart(pdo) && self.pdos.length(pdo) != Some(received) {
+            // It is the other node's.
+            Some(Length::Discarded)
+        } else {
+            self.pdos.receive(now, pdo, received)
+        };
         let discarded = matches!(length, None | Some(Length::Discarded));
         if length != Some(Length::Right) {
             outputs.node(self.id, NodeEvent::PdoLength { pdo, received, discarded });
@@ -241,9 +290,8 @@ impl Node {
         if discarded {
             return;
         }
-        if let Some(evidence) = self.duplicate.handle_pdo(now, pdo) {
-            outputs.node(self.id, NodeEvent::DuplicateSuspected { evidence });
-        }
+        let evidence = self.duplicate.handle_pdo(now, pdo);
+        self.suspect(evidence, outputs);
         self.believe_operational(now, pdo, outputs);
         let mut data = [0; 8];
         for (to, from) in data.iter_mut().zip(frame.data()) {
@@ -289,7 +337,7 @@ impl Node {
         }
         self.frame_seen(now, outputs);
         match *frame.data() {
-            [] => return self.boot_up(now, outputs),
+            [] => return self.boot_up(now, false, outputs),
             [low, high, register, ref rest @ ..] => {
                 let mut vendor = [0; 5];
                 for (to, from) in vendor.iter_mut().zip(rest) {
@@ -297,6 +345,10 @@ impl Node {
                 }
                 let code = u16::from_le_bytes([low, high]);
                 outputs.node(self.id, NodeEvent::Emergency { code, register, vendor });
+                if code == COLLISION {
+                    let evidence = self.duplicate.handle_collision(now);
+                    self.suspect(evidence, outputs);
+                }
             }
             _ => outputs.node(self.id, NodeEvent::Malformed { frame: *frame }),
         }
@@ -311,6 +363,8 @@ impl Node {
         outputs: &mut Outputs,
     ) {
         self.frame_seen(now, outputs);
+        let evidence = self.duplicate.handle_sdo_answer(now, frame);
+        self.suspect(evidence, outputs);
         if let Some(sdo) = &mut self.sdo {
             sdo.handle_answer(now, frame);
         }
@@ -346,5 +400,14 @@ impl Node {
         if let Some(state) = reached.filter(|_| self.seen) {
             self.set_state(state, true, outputs);
         }
+    }
+}
+
+/// What a state frame is for certain, by the verdict on it. A reply that comes late is neither.
+fn kind_of(verdict: Verdict, toggle: bool) -> Option<StateKind> {
+    match verdict {
+        Verdict::Valid { .. } | Verdict::ToggleError(_) if toggle => Some(StateKind::Reply),
+        Verdict::Unsolicited { unasked: true, .. } if !toggle => Some(StateKind::Heartbeat),
+        Verdict::Valid { .. } | Verdict::ToggleError(_) | Verdict::Unsolicited { .. } => None,
     }
 }

@@ -49,7 +49,10 @@ impl Node {
                 self.boot_output(now, output, outputs);
             } else if let Some(output) = self.sdo.as_mut().and_then(SdoClient::poll_output) {
                 match output {
-                    SdoOutput::Transmit(frame) => outputs.transmit(frame),
+                    SdoOutput::Transmit(frame) => {
+                        self.duplicate.handle_sdo_request(now, &frame);
+                        outputs.transmit(frame);
+                    }
                     SdoOutput::Done(id, result) if Boot::is_mine(id) => self.boot.handle_sdo(now, id, result),
                     SdoOutput::Done(id, result) if Polls::is_mine(id) => {
                         if let Some(poll) = self.polls.handle_sdo(id) {

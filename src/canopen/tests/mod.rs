@@ -5,12 +5,14 @@
 //! - `boot`: a node that is configured before it is started.
 //! - `broadcasts`: SYNC and TIME. `supply`: RPDOs.
 //! - `duties`: starting, orders, TPDOs, heartbeat.
-//! - `surroundings`: other masters, strangers, duplicate ids, the passive role, a bus that fails.
+//! - `surroundings`: other masters, strangers, the passive role, a bus that fails.
+//! - `duplicates`: two devices with one node id.
 //! - `properties`: random input; a day of quiet guarding.
 
 mod bench;
 mod boot;
 mod broadcasts;
+mod duplicates;
 mod duties;
 mod properties;
 mod supply;

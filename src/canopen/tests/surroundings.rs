@@ -1,4 +1,4 @@
-//! What comes from outside: other masters, strangers, two nodes with one id, a bus that fails; and the passive role.
+//! What comes from outside: other masters, strangers, a bus that fails; and the passive role.
 
 use super::bench::{Bench, detcon, master, mute, passive, running, running_with, usable};
 use crate::canopen::{
@@ -248,35 +248,6 @@ fn resync_bears_with_a_second_guarding_master_and_strict_does_not() {
             "{told:?}"
         );
     }
-}
-
-#[test]
-fn a_node_id_that_answers_each_request_twice_is_suspected_and_cleared() {
-    let mut bench = running_with(mute());
-    for request in 1..=4 {
-        let byte = if request % 2 == 1 { "85" } else { "05" };
-        bench.run(500 * request).frame(500 * request + 1, &format!("701#{byte}"));
-        bench.frame(500 * request + 2, &format!("701#{byte}"));
-    }
-    assert_eq!(
-        bench.take_those_with("Duplicate"),
-        ["1502 DuplicateSuspected { evidence: \"guard requests are answered twice\" }"]
-    );
-    for request in 5..=70 {
-        let byte = if request % 2 == 1 { "85" } else { "05" };
-        bench.run(500 * request).frame(500 * request + 1, &format!("701#{byte}"));
-    }
-    assert_eq!(bench.take_those_with("Duplicate"), ["32002 DuplicateCleared"]);
-}
-
-#[test]
-fn a_boot_up_while_tpdos_go_on_is_a_second_node() {
-    let mut bench = running();
-    bench.frames(&[(400, "181#0000000000000000"), (450, "701#00"), (460, "281#0000000000000000")]);
-    assert_eq!(
-        bench.take_those_with("Duplicate"),
-        ["460 DuplicateSuspected { evidence: \"a boot-up message while TPDOs go on\" }"]
-    );
 }
 
 #[test]
