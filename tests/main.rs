@@ -5,6 +5,7 @@
 //! | `architecture` | which room may import which; file sizes; what the pure rooms must not touch |
 //! | `conversations` | the gateway core against scripted frames, in candump notation |
 //! | `devices` | the gateway core against our simulators, with loss, delay and duplicates |
+//! | `neighbours` | the gateway beside a second device of the same node id, and beside healthy ones |
 //! | `eds` | EDS and DCF files of any quality become mappings; an import moves nothing that it gave away |
 //! | `mappings` | every shipped mapping checks; every message about a wrong one says what, where and how to mend it |
 //! | `contract` | golden files: register map, topics, payloads. Never edited to pass |
@@ -54,6 +55,7 @@ mod mappings;
 mod modbus_server;
 mod mqtt_client;
 mod mqtt_publisher;
+mod neighbours;
 mod outputs;
 mod properties;
 mod requirements;

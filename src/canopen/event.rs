@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::boot::BootEvent;
+use super::object::ObjectId;
 use super::sdo::{SdoError, TransferId};
 use super::{NmtRequest, NmtState, NodeId, PdoIndex, RpdoIndex};
 use crate::can::{CanFrame, CanId};
@@ -122,6 +123,13 @@ pub enum NodeEvent {
     ForeignGuardMaster,
     /// No guard request of somebody else for 60 s after `ForeignGuardMaster`.
     ForeignGuardMasterGone,
+    /// Somebody else accesses an object of this node by SDO. Of reads the first, and again after 60 s without; of writes all.
+    ForeignSdo {
+        /// Which.
+        object: ObjectId,
+        /// Whether it is changed.
+        write: bool,
+    },
     /// A frame on the error control identifier with a wrong length (R-DET-042), of which the first byte counts if there
     /// is one; or an emergency message that is too short, or a remote or 29-bit frame on one of the node's identifiers
     /// (R-DET-006), which are ignored.
@@ -212,6 +220,8 @@ pub enum ForeignEvent {
         /// Whether it is the first on this bus.
         first: bool,
     },
+    /// Somebody else uses LSS: told the first time, and again after 60 s without.
+    Lss,
     /// A frame of an identifier that belongs to no configured node, or a malformed NMT command.
     UnknownId {
         /// The identifier.

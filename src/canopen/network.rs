@@ -4,9 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use super::broadcasts::Broadcasts;
+use super::lss;
 use super::node::{Node, SdoRefused};
 use super::outputs::Outputs;
-use super::sdo::{SdoRequest, TransferId};
+use super::sdo::{SdoRequest, TransferId, request_id};
 use super::{
     ErrorControl, ForeignEvent, NetworkOutput, NetworkSettings, NmtRequest, NodeEvent, NodeId, PdoIndex,
     Role, RpdoIndex, cob_id,
@@ -21,6 +22,9 @@ const STAGGER: Duration = Duration::from_millis(10);
 /// Foreign 29-bit identifiers that are remembered; those beyond are never called new.
 const REMEMBERED: usize = 256;
 
+/// Others who do the same again within this time need not be told of again.
+pub(super) const FOREIGN_QUIET: Duration = Duration::from_secs(60);
+
 /// One bus as its NMT master, or a passive listener, sees it.
 #[derive(Debug)]
 pub struct Network {
@@ -33,6 +37,8 @@ pub struct Network {
     extended: BTreeMap<u32, Slot>,
     strangers: Strangers,
     broadcasts: Broadcasts,
+    /// When somebody else used LSS the last time.
+    foreign_lss: Option<Instant>,
     outputs: Outputs,
     link_up: bool,
     /// The wall clock of the host is right.
@@ -51,6 +57,7 @@ enum Slot {
     ErrorControl(usize),
     Emergency(usize),
     SdoAnswer(usize),
+    SdoRequest(usize),
     Pdo(usize, PdoIndex),
 }
 
@@ -58,9 +65,11 @@ impl Slot {
     fn node(self) -> Option<usize> {
         match self {
             Self::Unknown | Self::Sync | Self::Time => None,
-            Self::ErrorControl(node) | Self::Emergency(node) | Self::SdoAnswer(node) | Self::Pdo(node, _) => {
-                Some(node)
-            }
+            Self::ErrorControl(node)
+            | Self::Emergency(node)
+            | Self::SdoAnswer(node)
+            | Self::SdoRequest(node)
+            | Self::Pdo(node, _) => Some(node),
         }
     }
 }
@@ -101,6 +110,7 @@ impl Network {
             extended: BTreeMap::new(),
             strangers: Strangers { standard: vec![false; STANDARD_IDS], extended: BTreeSet::new() },
             broadcasts: Broadcasts::new(settings.role, settings.sync, settings.time),
+            foreign_lss: None,
             outputs: Outputs::new(),
             link_up: false,
             clock_synchronised: false,
@@ -118,6 +128,7 @@ impl Network {
             if node.sdo.is_some() {
                 network.claim(cob_id::sdo_answer(node.id), Slot::SdoAnswer(place));
             }
+            network.claim(request_id(node.id), Slot::SdoRequest(place));
             let cob_ids = node.pdos.iter().map(|pdo| pdo.cob_id).enumerate();
             pdos.extend(cob_ids.map(|(index, id)| (id, Slot::Pdo(place, PdoIndex(index)))));
             let phase = step.saturating_mul(u32::try_from(place).unwrap_or(0));
@@ -154,6 +165,10 @@ impl Network {
             (Slot::SdoAnswer(_), Some(node)) => {
                 node.handle_sdo_answer(at, frame, outputs);
                 false
+            }
+            (Slot::SdoRequest(_), Some(node)) => {
+                node.handle_foreign_sdo(at, frame, outputs);
+                return;
             }
             (Slot::Unknown | Slot::Sync | Slot::Time, _) | (_, None) => {
                 self.handle_stranger(at, slot, frame);
@@ -379,6 +394,12 @@ impl Network {
                 each.handle_foreign_command(now, request, &mut self.outputs);
             }
             self.look_ahead();
+        } else if id == lss::REQUEST_ID && !frame.is_remote() {
+            // A search for devices takes thousands of them.
+            let last = self.foreign_lss.replace(now);
+            if last.is_none_or(|last| now.since(last) > FOREIGN_QUIET) {
+                self.outputs.foreign(ForeignEvent::Lss);
+            }
         } else if let Some(node) = self.imitated(id).and_then(|place| self.nodes.get_mut(place)) {
             node.handle_foreign_format(frame, &mut self.outputs);
         } else {

@@ -5,9 +5,9 @@ use std::time::Duration;
 use super::events::Name;
 use super::node::Node;
 use super::{Gateway, Output};
-use crate::can::{BusCounters, BusIndex, CanFrame, Link};
+use crate::can::{BusCounters, BusIndex, CanFrame, CanId, Link};
 use crate::canopen::{
-    ErrorControl, ForeignEvent, Network, NetworkOutput, NetworkSettings, NodeSettings, Role,
+    ErrorControl, ForeignEvent, Network, NetworkOutput, NetworkSettings, NodeId, NodeSettings, Role, cob_id,
 };
 use crate::mapping::{AlarmOwner, BuiltIn, NodeDef, TagTable};
 use crate::process_image::{BusState, BusStatus, Event, NodeIndex, Quality, Reason, Value};
@@ -393,7 +393,7 @@ impl Gateway {
         }
     }
 
-    fn count_foreign_frame(&mut self, index: BusIndex) {
+    pub(super) fn count_foreign_frame(&mut self, index: BusIndex) {
         if let Some(bus) = self.buses.get_mut(index.0) {
             bus.foreign = bus.foreign.saturating_add(1);
             bus.status.foreign_frames = bus.status.foreign_frames.saturating_add(1);
@@ -404,9 +404,7 @@ impl Gateway {
     fn foreign_event(&mut self, now: Now, index: BusIndex, event: &ForeignEvent) {
         match event {
             ForeignEvent::NmtCommand { command, node } => {
-                if self.buses.get(index.0).is_some_and(|bus| bus.role == Role::Master) {
-                    self.conditions.pulse(now, AlarmOwner::Bus(index), BuiltIn::ForeignMaster);
-                }
+                self.foreign_master(now, index);
                 self.tell_bus(now, index, "foreign_nmt_command", |event| {
                     event.value = Some(Value::Unsigned((*command).into()));
                     event.text =
@@ -423,15 +421,21 @@ impl Gateway {
             ForeignEvent::Time { produced, first } => {
                 self.foreign_broadcast(now, index, "TIME", *produced, *first);
             }
+            ForeignEvent::Lss => {
+                self.foreign_master(now, index);
+                self.tell_bus(now, index, "foreign_lss", |event| {
+                    event.text =
+                        "somebody else looks for devices by LSS, or changes a node id or bit rate".into();
+                });
+            }
             ForeignEvent::UnknownId { id, node, first } => {
                 self.count_foreign_frame(index);
                 if *first {
+                    let node = *node;
+                    let known = node.is_some_and(|node| self.is_configured(index, node));
                     self.tell_bus(now, index, "unknown_id", |event| {
                         event.value = Some(Value::Unsigned(id.raw().into()));
-                        event.text = match node {
-                            Some(node) => format!("{id} comes from node {node}, which is not configured"),
-                            None => format!("{id} belongs to no configured node"),
-                        };
+                        event.text = stranger(*id, node, known);
                     });
                 }
             }
@@ -461,6 +465,18 @@ impl Gateway {
         }
     }
 
+    /// Somebody else does what a master does. In the passive role that is as it should be.
+    pub(super) fn foreign_master(&mut self, now: Now, index: BusIndex) {
+        if self.buses.get(index.0).is_some_and(|bus| bus.role == Role::Master) {
+            self.conditions.pulse(now, AlarmOwner::Bus(index), BuiltIn::ForeignMaster);
+        }
+    }
+
+    fn is_configured(&self, index: BusIndex, node: NodeId) -> bool {
+        let bus = self.buses.get(index.0);
+        bus.and_then(|bus| bus.by_id.get(usize::from(node.get()))).is_some_and(Option::is_some)
+    }
+
     pub(super) fn refresh_nodes_of(&mut self, now: Now, index: BusIndex) {
         let members = self.buses.get(index.0).map_or(0, |bus| bus.members.len());
         for place in 0..members {
@@ -474,6 +490,24 @@ impl Gateway {
     fn tell_bus(&mut self, now: Now, index: BusIndex, name: &'static str, fill: impl FnOnce(&mut Event)) {
         self.events.record(now, AlarmOwner::Bus(index), Name::Word(name), fill);
     }
+}
+
+/// What the first frame of an identifier of nobody's may mean. `known`: its node id is that of a configured node.
+fn stranger(id: CanId, node: Option<NodeId>, known: bool) -> String {
+    let Some(node) = node else { return format!("{id} belongs to no configured node") };
+    if known {
+        return format!(
+            "{id} stands for node {node}, but the mapping of that node does not know it: it leaves something out, or \
+             another device has the same node id"
+        );
+    }
+    if id == cob_id::error_control(node) {
+        return format!(
+            "{id} is a heartbeat, boot-up message or guard request of node {node}, which is not configured: another \
+             master, or a device that the configuration leaves out"
+        );
+    }
+    format!("{id} comes from node {node}, which is not configured")
 }
 
 fn state(link: Link) -> BusState {

@@ -4,6 +4,7 @@ use super::Gateway;
 use super::events::Name;
 use super::node::{Loss, Node};
 use crate::can::{CanFrame, CanId};
+use crate::canopen::object::ObjectId;
 use crate::canopen::{ErrorControl, NmtRequest, NmtState, NodeEvent, PdoIndex};
 use crate::mapping::{AlarmOwner, BuiltIn};
 use crate::process_image::{Event, NodeCounters, NodeIndex, Quality, Reason, Value};
@@ -65,6 +66,7 @@ impl Gateway {
                 self.change(index, |node| node.foreign_guard = false);
                 self.tell(at, "foreign_guard_master_gone", |_| ());
             }
+            NodeEvent::ForeignSdo { object, write } => self.foreign_sdo(at, object, write),
             NodeEvent::StartHeldBack { wait } => {
                 self.change(index, |node| node.start_held_back = true);
                 self.tell(at, "start_held_back", |event| {
@@ -386,7 +388,26 @@ impl Gateway {
         });
         let number = self.pdo_number(at.1, pdo);
         self.tell(at, "duplicate_told_apart", |event| {
-            event.text = format!("frames of TPDO{number} that have another length than the mapping says are ignored");
+            event.text =
+                format!("frames of TPDO{number} that have another length than the mapping says are ignored");
+        });
+    }
+
+    /// Somebody else reads an object, which harms nobody, or writes one.
+    fn foreign_sdo(&mut self, at: (Now, NodeIndex), object: ObjectId, write: bool) {
+        self.count_foreign_frame_of(at.1);
+        if !write {
+            return self.tell(at, "foreign_sdo_read", |event| {
+                event.text =
+                    "somebody else reads objects of this node by SDO: another master, or a tool".into();
+            });
+        }
+        if let Some(bus) = self.table.nodes.get(at.1.0).map(|def| def.bus) {
+            self.foreign_master(at.0, bus);
+        }
+        self.tell(at, "foreign_sdo_write", |event| {
+            event.to = object.to_string();
+            event.text = format!("somebody else writes {object} of this node: it may not be set as it was");
         });
     }
 

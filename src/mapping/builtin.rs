@@ -149,8 +149,8 @@ pub const OF_BUS: &[BuiltinAlarm] = &[
         latch: true,
         suppressed_by: &[],
         bit: None,
-        text: "Somebody else sends NMT commands on this bus.",
-        action: "Find the other master; make one of the two passive.",
+        text: "Somebody else acts as a master on this bus.",
+        action: "See in the events what was seen, find the other master or tool, and let only one of the two be master.",
     },
     BuiltinAlarm {
         name: "foreign_producer",

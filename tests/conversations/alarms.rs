@@ -171,6 +171,41 @@ fn somebody_elses_nmt_command_is_an_alarm() {
 }
 
 #[test]
+fn a_tool_that_reads_objects_is_told_and_whoever_writes_them_or_uses_lss_is_another_master() {
+    for (frame, event, text) in [
+        ("601#2B171000F4010000", "foreign_sdo_write", "writes 0x1017:0"),
+        ("7E5#0401000000000000", "foreign_lss", "node id or bit rate"),
+    ] {
+        let mut conversation = running(detcon());
+        conversation.frame("601#4000100000000000");
+        assert_eq!(conversation.events_named("foreign_sdo_read").len(), 1);
+        assert_eq!(conversation.active(), [""; 0]);
+        conversation.frame(frame);
+        assert_eq!(conversation.active(), ["foreign_master"], "{frame}");
+        assert!(conversation.events_named(event)[0].text.contains(text), "{frame}");
+    }
+}
+
+#[test]
+fn frames_of_nobodys_are_told_with_what_they_may_mean_and_no_alarm() {
+    let mut conversation = running(detcon());
+    for (frame, text) in [
+        (
+            "77F#05",
+            "heartbeat, boot-up message or guard request of node 127, which is not configured: another master",
+        ),
+        ("185#00", "185 comes from node 5, which is not configured"),
+        ("201#00", "201 belongs to no configured node"),
+        ("581#6017100000000000", "581 stands for node 1, but the mapping of that node does not know it"),
+    ] {
+        conversation.frame(frame);
+        let events = conversation.events_named("unknown_id");
+        assert!(events.last().is_some_and(|event| event.text.contains(text)), "{frame}: {events:?}");
+    }
+    assert_eq!(conversation.active(), [""; 0]);
+}
+
+#[test]
 fn v_det_10_r_det_085_sensor_fault_only_for_used_and_bad() {
     let mut conversation = running(detcon());
     conversation.stop_sending("381");

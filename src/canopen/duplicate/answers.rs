@@ -175,8 +175,7 @@ mod tests {
     #[test]
     fn the_heartbeat_time_is_learned_from_what_is_read_and_written() {
         let mut answers = Answers::default();
-        let ask =
-            |frame: &str| answers.clone().handle_request(Instant::START, &frame.parse().unwrap());
+        let ask = |frame: &str| answers.clone().handle_request(Instant::START, &frame.parse().unwrap());
         assert_eq!(ask("601#2B171000F4010000"), Some(Duration::from_millis(500)));
         assert_eq!(ask("601#2B181000F4010000"), None);
         let mut hear = |frame: &str| answers.handle_answer(Instant::START, &frame.parse().unwrap()).1;

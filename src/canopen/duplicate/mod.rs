@@ -377,12 +377,14 @@ mod tests {
     }
 
     #[test]
-    fn heartbeats_far_too_often_for_what_the_node_told_are_suspicious_and_so_are_both_kinds_of_error_control() {
+    fn heartbeats_far_too_often_for_what_the_node_told_are_suspicious_and_so_are_both_kinds_of_error_control()
+    {
         let mut watch = watch();
         watch.handle_sdo_answer(at(0), &"581#4B171000F4010000".parse().unwrap());
         let alone = (0..1000).filter_map(|beat| watch.handle_state(at(500 * beat), StateKind::Heartbeat));
         assert_eq!(alone.count(), 0);
-        let both = (0..1000).find_map(|beat| watch.handle_state(at(500_000 + 250 * beat), StateKind::Heartbeat));
+        let both =
+            (0..1000).find_map(|beat| watch.handle_state(at(500_000 + 250 * beat), StateKind::Heartbeat));
         assert!(both.is_some());
 
         let mut mixed = self::watch();

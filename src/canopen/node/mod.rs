@@ -65,6 +65,8 @@ pub(super) struct Node {
     pub(super) overheard_request: bool,
     /// Until then somebody else is known to guard this node.
     pub(super) foreign_guard_until: Option<Instant>,
+    /// When somebody else read an object the last time.
+    foreign_read: Option<Instant>,
     pub(super) seen: bool,
     never_seen_after: Duration,
     never_seen_at: Option<Instant>,
@@ -113,6 +115,7 @@ impl Node {
             supervised: false,
             overheard_request: false,
             foreign_guard_until: None,
+            foreign_read: None,
             seen: false,
             never_seen_after: settings.never_seen_after,
             never_seen_at: Some(now + settings.never_seen_after),

@@ -148,13 +148,7 @@ impl Node {
     }
 
     /// Tells what a guard reply was; `None` where its state does not count, else whether it ended the loss.
-    fn weigh(
-        &mut self,
-        now: Instant,
-        verdict: Verdict,
-        byte: u8,
-        outputs: &mut Outputs,
-    ) -> Option<bool> {
+    fn weigh(&mut self, now: Instant, verdict: Verdict, byte: u8, outputs: &mut Outputs) -> Option<bool> {
         match verdict {
             Verdict::Valid { recovered, wrong_toggle } => {
                 self.duplicate.handle_reply(byte);

@@ -3,6 +3,8 @@
 use std::time::Duration;
 
 use super::super::boot::{Boot, BootEvent, BootOutput, MappedPdo};
+use super::super::network::FOREIGN_QUIET;
+use super::super::object::ObjectId;
 use super::super::outputs::Outputs;
 use super::super::polls::Polls;
 use super::super::sdo::{SdoClient, SdoError, SdoOutput, SdoRequest, TransferId};
@@ -28,6 +30,30 @@ impl Node {
         self.sdo.as_mut().ok_or(SdoRefused::NoSdo)?.request(now, id, request)?;
         self.transfer(now, outputs);
         Ok(())
+    }
+
+    /// An SDO request of somebody else. Of a transfer only its begin says what it is about.
+    pub(in crate::canopen) fn handle_foreign_sdo(
+        &mut self,
+        now: Instant,
+        frame: &CanFrame,
+        outputs: &mut Outputs,
+    ) {
+        self.duplicate.handle_sdo_request(now, frame);
+        let &[command, low, high, sub, ..] = frame.data() else { return };
+        let write = match (command >> 5, command & 0x01) {
+            (1, _) | (6, 0) => true,
+            (2, _) | (5, 0) => false,
+            _ => return,
+        };
+        let told = !write && self.foreign_read.is_some_and(|last| now.since(last) <= FOREIGN_QUIET);
+        if !write {
+            self.foreign_read = Some(now);
+        }
+        if !told {
+            let object = ObjectId::new(u16::from_le_bytes([low, high]), sub);
+            outputs.node(self.id, NodeEvent::ForeignSdo { object, write });
+        }
     }
 
     /// An SDO request of ours did not leave.

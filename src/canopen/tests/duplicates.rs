@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use super::bench::{Bench, detcon, master, mute, passive, running, running_with};
-use crate::canopen::sdo::{SdoRequest, SdoSettings, TransferId};
 use crate::canopen::object::ObjectId;
+use crate::canopen::sdo::{SdoRequest, SdoSettings, TransferId};
 use crate::canopen::{ErrorControl, NmtRequest, NodeId, NodeSettings};
 use crate::time::Now;
 
@@ -148,7 +148,11 @@ fn one_reset_with_two_boot_up_messages_is_two_devices_and_a_bouncing_plug_is_not
     let mut old = running_with(mute());
     assert!(old.request(1000, 1, NmtRequest::ResetNode));
     old.frame(1200, "081#").frame(1201, "701#00").run(10_000);
-    assert_eq!(old.take_those_with(TOLD), Vec::<String>::new(), "some devices tell their boot-up in both ways");
+    assert_eq!(
+        old.take_those_with(TOLD),
+        Vec::<String>::new(),
+        "some devices tell their boot-up in both ways"
+    );
 }
 
 #[test]
@@ -189,7 +193,9 @@ fn a_device_that_reports_a_collision_itself_is_believed() {
     bench.frame(400, "081#5081110000000000");
     assert_eq!(
         bench.take_those_with(TOLD),
-        ["400 DuplicateSuspected { evidence: \"the device reports that its identifiers collide, EMCY 0x8150\" }"]
+        [
+            "400 DuplicateSuspected { evidence: \"the device reports that its identifiers collide, EMCY 0x8150\" }"
+        ]
     );
 }
 

@@ -50,7 +50,7 @@ fn unknown_identifiers_are_new_once_and_the_memory_for_them_is_bounded() {
             "3 Sync { produced: false, first: false }",
             "4 UnknownId { id: 17F, node: None, first: true }",
             "5 UnknownId { id: 682, node: None, first: true }",
-            "6 UnknownId { id: 7E5, node: None, first: true }",
+            "6 Lss",
         ]
     );
 }
@@ -270,4 +270,89 @@ fn a_reply_received_in_time_but_handed_over_late_is_valid() {
         "Node(node 1, FrameSeen)"
     );
     assert_eq!(bench.network.poll_output(), None, "not unsolicited");
+}
+
+#[test]
+fn lss_requests_of_somebody_else_are_told_until_60_s_without() {
+    let mut bench = running_with(mute());
+    for millis in [100, 110, 120, 60_000, 120_000] {
+        bench.frame(millis, "7E5#0400000000000000");
+    }
+    assert_eq!(bench.take_those_with("Lss"), ["100 Lss"]);
+    bench.frame(180_001, "7E5#5100000000800000");
+    assert_eq!(bench.take_those_with("Lss"), ["180001 Lss"]);
+}
+
+#[test]
+fn somebody_elses_sdo_requests_are_told_reads_once_and_writes_with_their_object() {
+    let mut bench = running_with(mute());
+    bench.frames(&[
+        (100, "601#4000100000000000"),
+        (101, "601#4018100100000000"),
+        (110, "601#A018100104000000"),
+        (120, "601#2B171000F4010000"),
+        (130, "601#2100300020000000"),
+        (131, "601#0041424344454647"),
+        (140, "601#C618100120000000"),
+        (141, "601#0141424344454647"),
+        (150, "601#8018100100000405"),
+        (160, "601#4000"),
+    ]);
+    assert_eq!(
+        bench.take(),
+        [
+            "100 ForeignSdo { object: ObjectId { index: 4096, sub: 0 }, write: false }",
+            "120 ForeignSdo { object: ObjectId { index: 4119, sub: 0 }, write: true }",
+            "130 ForeignSdo { object: ObjectId { index: 12288, sub: 0 }, write: true }",
+            "140 ForeignSdo { object: ObjectId { index: 4120, sub: 1 }, write: true }",
+            "160 ForeignSdo { object: ObjectId { index: 0, sub: 0 }, write: false }",
+        ]
+    );
+}
+
+/// A node that sends heartbeats.
+fn heartbeat_node() -> NodeSettings {
+    let timeout = std::time::Duration::from_millis(1500);
+    NodeSettings { error_control: ErrorControl::Heartbeat { timeout }, ..mute() }
+}
+
+#[test]
+fn passive_states_are_taken_from_heartbeats_commands_and_boot_up_messages() {
+    let mut bench = Bench::new(passive(vec![heartbeat_node()]));
+    bench.frames(&[
+        (100, "000#0201"),
+        (200, "701#7F"),
+        (1200, "701#05"),
+        (1300, "000#8001"),
+        (2200, "701#7F"),
+        (2300, "000#0100"),
+        (3200, "701#05"),
+        (3300, "000#8201"),
+        (3400, "701#00"),
+        (3500, "701#7F"),
+        (3600, "081#"),
+    ]);
+    bench.run(60_000);
+    assert_eq!(
+        bench.take_those_with("State"),
+        [
+            "200 State { from: None, to: PreOperational, ordered: true }",
+            "1200 State { from: Some(PreOperational), to: Operational, ordered: false }",
+            "1300 State { from: Some(Operational), to: PreOperational, ordered: true }",
+            "3200 State { from: Some(PreOperational), to: Operational, ordered: true }",
+            "3400 State { from: Some(Operational), to: Initialising, ordered: true }",
+            "3500 State { from: Some(Initialising), to: PreOperational, ordered: true }",
+            "3600 State { from: Some(PreOperational), to: Initialising, ordered: true }",
+        ]
+    );
+}
+
+#[test]
+fn passive_a_heartbeat_that_stays_away_loses_the_node_and_nothing_is_ever_sent() {
+    let mut bench = Bench::new(passive(vec![heartbeat_node()]));
+    bench.run(30_000).frame(31_000, "701#05").run(40_000).frame(40_000, "701#7F").run(41_000);
+    let told = bench.take();
+    assert!(told.contains(&"32500 Lost { stuck_toggle: false }".to_owned()), "{told:?}");
+    assert!(told.contains(&"40000 Recovered".to_owned()), "{told:?}");
+    assert!(told.iter().all(|line| !line.contains('#')), "{told:?}");
 }
