@@ -249,7 +249,7 @@ async fn the_demo_shows_values_and_prints_what_to_connect_where() {
     let mut demo = Running::start(cangate().args(arguments));
     let mut lines = BufReader::new(demo.0.stdout.take().unwrap()).lines();
     let said: Vec<String> =
-        tokio::task::spawn_blocking(move || lines.by_ref().map_while(Result::ok).take(8).collect())
+        tokio::task::spawn_blocking(move || lines.by_ref().map_while(Result::ok).take(12).collect())
             .await
             .unwrap();
     let said = said.join("\n");
@@ -259,6 +259,7 @@ async fn the_demo_shows_values_and_prints_what_to_connect_where() {
         "mosquitto_sub",
         &mqtt.port().to_string(),
         &format!("http://{http}/"),
+        "hydraulics",
     ] {
         assert!(said.contains(part), "`{part}` is missing in:\n{said}");
     }
@@ -268,6 +269,13 @@ async fn the_demo_shows_values_and_prints_what_to_connect_where() {
         registers.iter().all(|register| *register <= 10_000).then_some(registers)
     });
     assert_eq!(value.await.len(), 20);
+    let mut hydraulics = connect(modbus, 5).await;
+    let pressure = until("the transmitter is configured and has a pressure", async || {
+        let registers = hydraulics.read_input_registers(100, 2).await.ok()?.ok()?;
+        let pressure = f32::from_bits(u32::from(registers[0]) << 16 | u32::from(registers[1]));
+        (100.0..450.0).contains(&pressure).then_some(pressure)
+    });
+    assert!(pressure.await > 0.0, "in bar, not in the psi of its shipping state");
     demo.signal(Signal::SIGINT);
     let (code, said) = tokio::task::spawn_blocking(move || demo.wait()).await.unwrap();
     assert_eq!(code, Some(0), "{said}");

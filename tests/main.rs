@@ -7,6 +7,7 @@
 //! | `devices` | the gateway core against our simulators, with loss, delay and duplicates |
 //! | `neighbours` | the gateway beside a second device of the same node id, and beside healthy ones |
 //! | `eds` | EDS and DCF files of any quality become mappings; an import moves nothing that it gave away |
+//! | `clashes` | identifiers that two participants of a bus would send |
 //! | `mappings` | every shipped mapping checks; every message about a wrong one says what, where and how to mend it |
 //! | `contract` | golden files: register map, topics, payloads. Never edited to pass |
 //! | `outputs` | RPDOs: who may be sent what; what a write needs; SYNC operation of a transmitter |
@@ -44,6 +45,7 @@
 
 mod adopt;
 mod architecture;
+mod clashes;
 mod contract;
 mod contract_mqtt;
 mod conversations;

@@ -59,11 +59,12 @@ fn p22_a_transmitter_with_the_node_id_of_a_detcon_is_told_and_the_values_stay_th
 fn p22_a_detcon_with_the_node_id_of_a_transmitter_is_told_and_nothing_is_silently_mixed() {
     let mut world = running();
     world.power_on(2, "quiet");
-    world.order("node 1 power off");
-    world.run_for(5000);
-    // Both send 8 bytes: without guarding nothing but the identifiers of its other TPDOs gives the stranger away.
-    let told = world.events("unknown_id") > 0;
-    assert!(told, "its TPDO2 is nobody's");
+    world.run_until(5000, is_suspected);
+    // Both send 8 bytes: in the long run only its other TPDOs give it away, of which the transmitter says that it has none.
+    world.run_for(60_000);
+    assert!(world.node(2).reason.contains("this device does not have"), "{}", world.node(2).reason);
+    assert_eq!(world.tag(2, "pressure").quality, Quality::Uncertain(Reason::DuplicateNode));
+    assert!(world.is_good(1), "the other node is not concerned");
 }
 
 #[test]

@@ -12,6 +12,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+use super::duplicate::{Answers, Extra};
 use super::{NmtRequest, NmtState, NodeId};
 use crate::can::{CanFrame, CanId};
 use crate::time::Instant;
@@ -22,6 +23,10 @@ pub const MOST_KINDS: usize = 256;
 const GOES_ON: Duration = Duration::from_secs(1);
 /// A state frame later than this after a guard request is no answer to it.
 const ANSWERS_WITHIN: Duration = Duration::from_millis(500);
+/// A state frame so soon after the answer to a guard request is a second answer.
+const ANSWERS_AGAIN_WITHIN: Duration = Duration::from_millis(50);
+/// SDO answers too many that are no chance; one that says something else counts twice.
+const EXTRA_ANSWERS: u8 = 2;
 /// LSS slave to master, master to slave (CiA 305).
 const LSS: [u16; 2] = [0x7E4, 0x7E5];
 
@@ -70,6 +75,8 @@ pub enum Suspicion {
     DifferentLengths,
     /// A boot-up message while TPDOs go on, which no start command explains.
     BootUpWhileRunning,
+    /// A guard request, or SDO requests, were answered twice.
+    AnsweredTwice,
 }
 
 impl Suspicion {
@@ -79,6 +86,7 @@ impl Suspicion {
         match self {
             Self::DifferentLengths => "frames of different lengths on one TPDO identifier",
             Self::BootUpWhileRunning => "a boot-up message while TPDOs went on",
+            Self::AnsweredTwice => "requests were answered twice",
         }
     }
 }
@@ -111,6 +119,10 @@ pub struct NodeRecord {
     /// Why two devices may share the id.
     pub suspicions: BTreeSet<Suspicion>,
     asked: Option<Instant>,
+    answered: Option<Instant>,
+    answers: Answers,
+    extra_answers: u8,
+    first_tpdo: Option<Instant>,
     last_tpdo: Option<Instant>,
     booted_while_running: Option<Instant>,
 }
@@ -140,7 +152,28 @@ impl NodeRecord {
         (1..).zip(&self.tpdos).filter(|(_, tpdo)| tpdo.count > 0)
     }
 
+    /// From its first TPDO to its last.
+    #[must_use]
+    pub fn listened(&self) -> Duration {
+        let span = self.first_tpdo.zip(self.last_tpdo);
+        span.map_or(Duration::ZERO, |(first, last)| last.since(first))
+    }
+
+    fn handle_sdo_answer(&mut self, now: Instant, frame: &CanFrame) {
+        self.sdo_answers = self.sdo_answers.saturating_add(1);
+        let weight = match self.answers.handle_answer(now, frame).0 {
+            None => return,
+            Some(Extra::Same) => 1,
+            Some(Extra::Different) => 2,
+        };
+        self.extra_answers = self.extra_answers.saturating_add(weight);
+        if self.extra_answers >= EXTRA_ANSWERS {
+            self.suspicions.insert(Suspicion::AnsweredTwice);
+        }
+    }
+
     fn handle_tpdo(&mut self, now: Instant, tpdo: usize, dlc: u8) {
+        self.first_tpdo.get_or_insert(now);
         self.last_tpdo = Some(now);
         if self.booted_while_running.take().is_some_and(|boot_up| now.since(boot_up) <= GOES_ON) {
             self.suspicions.insert(Suspicion::BootUpWhileRunning);
@@ -164,6 +197,12 @@ impl NodeRecord {
             return;
         }
         self.states.add(now, dlc);
+        let again = self.answered.is_some_and(|answered| now.since(answered) <= ANSWERS_AGAIN_WITHIN);
+        self.answered = asked.then_some(now);
+        if again && !asked {
+            self.suspicions.insert(Suspicion::AnsweredTwice);
+            return;
+        }
         // A guarded node never tells by itself, so one unasked state settles it.
         if !asked {
             self.reports = Some(Reports::Heartbeat);
@@ -243,14 +282,16 @@ impl Census {
         }
     }
 
-    /// Takes a frame that we sent ourselves, so that the answer to a guard request is known as one.
+    /// Takes a frame that we sent ourselves, so that the answer to a guard or SDO request is known as one.
     pub fn handle_sent(&mut self, now: Instant, frame: &CanFrame) {
-        if let CanId::Standard(id) = frame.id()
-            && frame.is_remote()
-            && id >> 7 == 0xE
-            && let Some(node) = u8::try_from(id & 0x7F).ok().and_then(NodeId::new)
-        {
-            self.nodes.entry(node).or_default().asked = Some(now);
+        let CanId::Standard(id) = frame.id() else { return };
+        let Some(node) = u8::try_from(id & 0x7F).ok().and_then(NodeId::new) else { return };
+        match (id >> 7, frame.is_remote()) {
+            (0xE, true) => self.nodes.entry(node).or_default().asked = Some(now),
+            (0xC, false) => {
+                self.nodes.entry(node).or_default().answers.handle_request(now, frame);
+            }
+            _ => {}
         }
     }
 
@@ -301,8 +342,11 @@ impl NodeRecord {
                     traffic.add(now, dlc);
                 }
             }
-            0xB => self.sdo_answers = self.sdo_answers.saturating_add(1),
-            0xC => self.sdo_requests = self.sdo_requests.saturating_add(1),
+            0xB => self.handle_sdo_answer(now, frame),
+            0xC => {
+                self.sdo_requests = self.sdo_requests.saturating_add(1);
+                self.answers.handle_request(now, frame);
+            }
             _ if frame.is_remote() => {
                 self.guard_requests.add(now, dlc);
                 self.asked = Some(now);
@@ -447,6 +491,23 @@ mod tests {
         let heard: Vec<u8> =
             census.nodes.iter().filter(|(_, node)| node.is_heard()).map(|(id, _)| id.get()).collect();
         assert_eq!(heard, [4]);
+    }
+
+    #[test]
+    fn answers_too_many_are_suspicious_and_a_second_guard_reply_is_no_heartbeat() {
+        let two = census(&[(0, "701#R1"), (1, "701#05"), (2, "701#85")]);
+        let node_1 = node(&two, 1);
+        assert_eq!(node_1.reports, Some(Reports::Guarding));
+        assert!(node_1.suspicions.contains(&Suspicion::AnsweredTwice));
+        let one = census(&[(0, "701#R1"), (1, "701#05"), (700, "701#R1"), (701, "701#85")]);
+        assert!(node(&one, 1).suspicions.is_empty());
+
+        let mut asked = Census::default();
+        asked.handle_sent(Instant::START, &"602#4018100400000000".parse().unwrap());
+        asked.handle_frame(Instant::from_millis(1), &"582#4318100440E20100".parse().unwrap());
+        assert!(node(&asked, 2).suspicions.is_empty());
+        asked.handle_frame(Instant::from_millis(2), &"582#4318100441E20100".parse().unwrap());
+        assert!(node(&asked, 2).suspicions.contains(&Suspicion::AnsweredTwice));
     }
 
     #[test]

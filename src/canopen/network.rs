@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::broadcasts::Broadcasts;
 use super::lss;
-use super::node::{Node, SdoRefused};
+use super::node::{Node, SdoRefused, predefined_tpdo};
 use super::outputs::Outputs;
 use super::sdo::{SdoRequest, TransferId, request_id};
 use super::{
@@ -403,6 +403,12 @@ impl Network {
         } else if let Some(node) = self.imitated(id).and_then(|place| self.nodes.get_mut(place)) {
             node.handle_foreign_format(frame, &mut self.outputs);
         } else {
+            let tpdo = predefined_tpdo(id).filter(|_| self.link_up);
+            let node = tpdo.and_then(|(owner, _)| self.nodes.iter_mut().find(|node| node.id == owner));
+            if let (Some((_, number)), Some(node)) = (tpdo, node) {
+                node.handle_strange_tpdo(now, number, frame, &mut self.outputs);
+                self.next = earlier(self.next, node.poll_timeout());
+            }
             let first = self.strangers.is_first(id);
             self.outputs.foreign(ForeignEvent::UnknownId { id, node: predefined_node(id), first });
         }

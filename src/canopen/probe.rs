@@ -1,7 +1,7 @@
 //! Asks who is there: the active half of a scan. Pure.
 //!
 //! [`Probe`] reads the device type 0x1000 of each node id by SDO; of those that answer also the identity 0x1018 and the
-//! device name 0x1008; to those that do not, and of which no state is known, it sends one guard request, whose answer the
+//! device name 0x1008, and how its first TPDO 0x1800:2 and its heartbeat 0x1017 are set; to those that do not, and of which no state is known, it sends one guard request, whose answer the
 //! [`Census`](super::census::Census) takes. It never asks node id 0, and writes nothing.
 //!
 //! A bus at work must not notice: one frame at most every [`ProbeSettings::gap`], segments of longer answers included.
@@ -19,12 +19,14 @@ use crate::time::Instant;
 /// Device type.
 const DEVICE_TYPE: ObjectId = ObjectId::new(0x1000, 0);
 /// What is read of a node that has answered.
-const MORE: [ObjectId; 5] = [
+const MORE: [ObjectId; 7] = [
     ObjectId::new(0x1018, 1),
     ObjectId::new(0x1018, 2),
     ObjectId::new(0x1018, 3),
     ObjectId::new(0x1018, 4),
     ObjectId::new(0x1008, 0),
+    ObjectId::new(0x1800, 2),
+    ObjectId::new(0x1017, 0),
 ];
 /// Frames in a row that did not leave, after which nobody is there who would acknowledge.
 const NOBODY: u32 = 10;
@@ -64,6 +66,10 @@ pub struct Identity {
     pub identity: [Option<u32>; 4],
     /// Manufacturer device name, 0x1008; control characters as `\x1B`.
     pub name: Option<String>,
+    /// Transmission type of TPDO1, 0x1800:2; up to 240 it follows SYNC.
+    pub tpdo1_type: Option<u32>,
+    /// Producer heartbeat time, 0x1017, in ms; 0 = no heartbeat.
+    pub heartbeat: Option<u32>,
 }
 
 /// What a probe wants done, or tells.
@@ -318,9 +324,12 @@ impl Probe {
         reading.pending = false;
         let gone = matches!(result, Err(SdoError::Timeout { .. } | SdoError::BusUnavailable));
         if let Ok(bytes) = result {
-            match reading.identity.identity.get_mut(reading.done) {
-                Some(place) => *place = number(&bytes),
-                None => reading.identity.name = DataType::VisibleString.decode(&bytes).ok(),
+            let identity = &mut reading.identity;
+            match (reading.done, identity.identity.get_mut(reading.done)) {
+                (_, Some(place)) => *place = number(&bytes),
+                (4, None) => identity.name = DataType::VisibleString.decode(&bytes).ok(),
+                (5, None) => identity.tpdo1_type = number(&bytes),
+                (_, None) => identity.heartbeat = number(&bytes),
             }
         }
         reading.done += 1;

@@ -50,6 +50,8 @@ fn dst() -> Answers {
         ("601#4008100000000000", "581#410810000C000000"),
         ("601#6000000000000000", "581#0044535420503932"),
         ("601#7000000000000000", "581#1543006F70000000"),
+        ("601#4000180200000000", "581#4F00180201000000"),
+        ("601#4017100000000000", "581#4B171000F4010000"),
     ]
     .into_iter()
     .map(|(request, answer)| (request.to_owned(), answer))
@@ -64,11 +66,14 @@ fn r_dst_001_a_node_that_answers_says_what_it_is() {
         device_type: Some(0x0002_0194),
         identity: [Some(0x23D), Some(0x1122_3344), None, Some(0x1234_5678)],
         name: Some("DST P92C\0op".to_owned()),
+        tpdo1_type: Some(1),
+        heartbeat: Some(500),
     };
     assert_eq!(told.len(), 2, "{told:?}");
     let ProbeOutput::Found(node, found) = &told[0] else { panic!("{told:?}") };
     assert_eq!(node.get(), 1);
     assert_eq!((found.device_type, found.identity), (identity.device_type, identity.identity));
+    assert_eq!((found.tpdo1_type, found.heartbeat), (identity.tpdo1_type, identity.heartbeat));
     assert!(found.name.as_ref().is_some_and(|name| name.starts_with("DST P92C")), "{found:?}");
     assert_eq!(told[1], ProbeOutput::Done { not_sent: 0, nobody_acknowledges: false });
 }

@@ -37,7 +37,7 @@ pub struct CommandLine {
 pub enum Subcommand {
     /// Run the gateway.
     Run(RunArguments),
-    /// Show everything with simulated engines: no hardware, no broker, no file.
+    /// Show everything with simulated devices: no hardware, no broker, no file.
     Demo(DemoArguments),
     /// Check configuration and mapping files; every problem with file, line, column and a hint.
     Check(CheckArguments),

@@ -1,4 +1,4 @@
-//! `cangate demo`: two simulated engines, a broker and the gateway in one process. \[IO\]
+//! `cangate demo`: two simulated engines, a simulated press, a broker and the gateway in one process. \[IO\]
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
@@ -16,7 +16,7 @@ use crate::simulator::task::BusEnd;
 use crate::supervisor::{self, Tasks, shutdown};
 use crate::time::Clock;
 
-/// The configuration of the demo; what a user would write for two engines.
+/// The configuration of the demo; what a user would write for two engines and a pressure transmitter.
 const CONFIGURATION: &str = r#"
 version = 1
 [gateway]
@@ -31,10 +31,14 @@ mapping = "motortech-detcon"
 bus = "demo"
 id = 2
 mapping = "motortech-detcon"
+[node.hydraulics]
+bus = "demo"
+id = 5
+mapping = "danfoss-dst-p92c"
 [mqtt]
 "#;
 
-/// Frames and events that wait between the engines and their bus.
+/// Frames and events that wait between the devices and their bus.
 const QUEUE: usize = 256;
 
 /// Runs until a signal.
@@ -77,9 +81,9 @@ pub(super) fn run(options: &DemoArguments) -> Exit {
             }
         };
         tell(&bound, &broker_url);
-        // A demo whose engines or broker died would go on without a word.
+        // A demo whose devices or broker died would go on without a word.
         let mut tasks = Tasks::default();
-        tasks.spawn("simulated engines", simulate(clock, stop.clone()));
+        tasks.spawn("simulated devices", simulate(clock, stop.clone()));
         let (back, broker_back) = oneshot::channel();
         tasks.spawn("broker", broker.watch(stop.clone(), back));
         let exit = run::ended(&bound.run(tasks, stop).await);
@@ -91,7 +95,7 @@ pub(super) fn run(options: &DemoArguments) -> Exit {
     })
 }
 
-/// The two engines on their virtual bus.
+/// The devices on their virtual bus.
 async fn simulate(clock: Clock, stop: CancellationToken) {
     let interface = Interface::Virtual("demo".to_owned());
     let (events_to_us, events) = mpsc::channel(QUEUE);
@@ -100,12 +104,12 @@ async fn simulate(clock: Clock, stop: CancellationToken) {
     let (_, lines) = mpsc::channel(1);
     let bus = can::task::run(BusIndex(0), interface, false, events_to_us, to_send, clock, stop.clone());
     let end = BusEnd { events, transmit };
-    // No reports either: what the engines do is seen through the gateway.
+    // No reports either: what the devices do is seen through the gateway.
     let (report, _) = mpsc::channel(1);
     tokio::join!(bus, simulator::task::run(simulator::demo(), end, lines, report, clock, stop));
 }
 
-/// The three lines that a newcomer can paste, and what there is to see.
+/// The lines that a newcomer can paste, and what there is to see.
 fn tell(bound: &supervisor::Bound, broker: &BrokerUrl) {
     let modbus = bound.modbus_addresses().first().copied();
     let (host, port) =
@@ -113,14 +117,19 @@ fn tell(bound: &supervisor::Bound, broker: &BrokerUrl) {
     let (broker_host, broker_port) = host_and_port(broker);
     let page = format!("http://{}/", reachable(bound.http_address()));
     for line in [
-        "cangate demo: two simulated engines; Ctrl-C ends it. Connect from another terminal:".to_owned(),
+        "cangate demo: two simulated engines and a press; Ctrl-C ends it. Connect from another terminal:".to_owned(),
         String::new(),
-        format!("  Modbus TCP   mbpoll -m tcp -a 1 -0 -r 100 -c 20 -t 3 -1 -p {port} {host}"),
+        format!("  engine 1     mbpoll -m tcp -a 1 -0 -r 100 -c 20 -t 3 -1 -p {port} {host}"),
+        format!("  hydraulics   mbpoll -m tcp -a 5 -0 -r 100 -c 1 -t 3:float -B -1 -p {port} {host}"),
         format!("  MQTT         mosquitto_sub -h {broker_host} -p {broker_port} -v -t 'cangate/#'"),
         format!("  page         {page}"),
         String::new(),
-        "Engine 1 knocks on cylinder 7 within ten seconds (register 106, unit 1), and again every minute;".to_owned(),
-        "unit 2 is the other engine, unit 247 the gateway. `cangate demo --help` tells how to move the ports.".to_owned(),
+        "Engine 1 knocks on cylinder 7 within ten seconds (register 106, unit 1), and again every minute. The press of the"
+            .to_owned(),
+        "hydraulics (unit 5) raises its pressure from 180 to 320 bar every 20 s: registers 100 and 101, a float in bar; 104,"
+            .to_owned(),
+        "tenths of a degree. Unit 2 is the other engine, unit 247 the gateway. `cangate demo --help`: how to move the ports."
+            .to_owned(),
         String::new(),
     ] {
         if !print_line(&line) {
@@ -226,7 +235,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_engines_of_the_demo_are_the_nodes_that_its_gateway_knows() {
+    fn the_devices_of_the_demo_are_the_nodes_that_its_gateway_knows() {
         let installation = load::installation_from_text(CONFIGURATION, "demo").unwrap();
         let configured: Vec<u8> = installation.table.nodes.iter().map(|node| node.canopen.id.get()).collect();
         let simulated: Vec<u8> = simulator::demo().iter().map(|plan| plan.node.get()).collect();

@@ -108,17 +108,22 @@ fn write(file: &Path, text: &str, force: bool) -> io::Result<()> {
     file.sync_all()
 }
 
-/// The mapping that a node gets without a person's look: the only one that is probable, of a node that nobody shares.
+/// The mapping that a node gets without a person's look: the one that it names itself, else the only one that is probable, of
+/// a node that nobody shares.
 fn chosen(node: &FoundNode) -> Option<&str> {
+    let alone = node.suspicions.is_empty() && node.heard;
+    if let Some(certain) = node.mappings.iter().find(|found| found.certain && alone) {
+        return Some(&certain.mapping);
+    }
     let mut probable = node.mappings.iter().filter(|found| found.probable);
     match (probable.next(), probable.next()) {
-        (Some(one), None) if node.suspicions.is_empty() && node.heard => Some(&one.mapping),
+        (Some(one), None) if alone => Some(&one.mapping),
         _ => None,
     }
 }
 
 /// The configuration for what was found.
-fn configuration(report: &ScanReport, name: &str) -> String {
+pub(super) fn configuration(report: &ScanReport, name: &str) -> String {
     let bus = if is_name(&report.interface) { &report.interface } else { "bus1" };
     let mut text = format!(
         "# Written by `cangate init` from what was seen on {}. Read it through: what was only overheard is a proposal.\n\
@@ -173,6 +178,12 @@ fn section(node: &FoundNode, bus: &str) -> String {
     }
     if let Some(mapping) = chosen(node) {
         let name = node_name(mapping, id);
+        if let Some(kind) = node.tpdo1_type.filter(|kind| *kind <= 240) {
+            let _ = writeln!(
+                text,
+                "# Its TPDO1 follows SYNC (transmission type {kind}), as shipped; the gateway sets it as the mapping says."
+            );
+        }
         let _ =
             writeln!(text, "[node.{name}]\nbus = {}\nid = {id}\nmapping = {}", quoted(bus), quoted(mapping));
         return text;
@@ -228,6 +239,7 @@ mod tests {
                 vendor: "Example".to_owned(),
                 model: "P5".to_owned(),
                 probable: *probable,
+                certain: false,
             })
             .collect();
         node

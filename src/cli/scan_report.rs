@@ -1,5 +1,6 @@
 //! What a scan found: for people as a table, for machines and `cangate init` as JSON.
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::time::Duration;
 
@@ -8,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::can::CanId;
 use crate::canopen::NodeId;
 use crate::canopen::census::{Census, NodeRecord, Reports, Traffic};
+use crate::canopen::object::ObjectId;
 use crate::canopen::probe::Identity;
 use crate::mapping::fingerprint::{Candidate, Fit, Sighting};
 
@@ -88,6 +90,12 @@ pub struct FoundNode {
     pub serial: Option<u32>,
     /// Device name, object 0x1008.
     pub name: Option<String>,
+    /// Transmission type of TPDO1, object 0x1800:2; up to 240 it follows SYNC.
+    #[serde(default)]
+    pub tpdo1_type: Option<u32>,
+    /// Heartbeat time that the node is set to, object 0x1017, ms; 0 = none.
+    #[serde(default)]
+    pub heartbeat_set_ms: Option<u32>,
     /// Mappings that fit, the best first.
     pub mappings: Vec<FoundMapping>,
     /// Why two devices may share the id.
@@ -105,6 +113,9 @@ pub struct FoundMapping {
     pub model: String,
     /// Whether it is more than a possibility.
     pub probable: bool,
+    /// Whether the node says so itself.
+    #[serde(default)]
+    pub certain: bool,
 }
 
 /// Frames of one identifier.
@@ -164,9 +175,26 @@ pub fn sighting(node: NodeId, record: &NodeRecord, identity: Option<&Identity>) 
     Sighting {
         node,
         tpdos: tpdos.collect(),
+        listened: record.listened(),
         heartbeat: record.reports.map(|reports| reports == Reports::Heartbeat),
         name: identity.and_then(|identity| identity.name.clone()),
+        identity: identity.map(told).unwrap_or_default(),
     }
+}
+
+/// What of an identity was read, by object.
+fn told(identity: &Identity) -> BTreeMap<ObjectId, u32> {
+    let device_type = (ObjectId::new(0x1000, 0), identity.device_type);
+    let parts = (1..).zip(identity.identity).map(|(sub, part)| (ObjectId::new(0x1018, sub), part));
+    std::iter::once(device_type).chain(parts).filter_map(|(object, value)| Some((object, value?))).collect()
+}
+
+/// A node that says to be one device and sends what another sends is two.
+fn two_devices(candidates: &[Candidate]) -> Option<String> {
+    let says = candidates.iter().find(|found| found.fit == Fit::Certain && !found.sends)?;
+    let sends = candidates.iter().find(|found| found.fit >= Fit::Probable && found.sends)?;
+    let name = |found: &Candidate| format!("{} {}", found.device.vendor, found.device.model);
+    Some(format!("it says to be {}, but its process data are those of {}", name(says), name(sends)))
 }
 
 fn tpdo_id(node: NodeId, number: u16) -> CanId {
@@ -215,8 +243,15 @@ pub fn found_node(
         revision,
         serial,
         name: identity.and_then(|identity| identity.name.clone()),
+        tpdo1_type: identity.and_then(|identity| identity.tpdo1_type),
+        heartbeat_set_ms: identity.and_then(|identity| identity.heartbeat),
+        suspicions: record
+            .suspicions
+            .iter()
+            .map(|suspicion| suspicion.text().to_owned())
+            .chain(two_devices(&candidates))
+            .collect(),
         mappings: candidates.into_iter().map(found_mapping).collect(),
-        suspicions: record.suspicions.iter().map(|suspicion| suspicion.text().to_owned()).collect(),
     }
 }
 
@@ -225,7 +260,8 @@ fn found_mapping(candidate: Candidate) -> FoundMapping {
         mapping: candidate.mapping,
         vendor: candidate.device.vendor,
         model: candidate.device.model,
-        probable: candidate.fit == Fit::Probable,
+        probable: candidate.fit >= Fit::Probable,
+        certain: candidate.fit == Fit::Certain,
     }
 }
 
@@ -358,7 +394,8 @@ fn what(node: &FoundNode) -> String {
     if let Some(best) = node.mappings.first() {
         let doubt = if best.probable { "" } else { "perhaps " };
         words.push(format!("{doubt}{} {}", best.vendor, best.model));
-        if node.mappings.get(1).is_some_and(|other| other.probable == best.probable) {
+        let equal = |other: &FoundMapping| !best.certain && other.probable == best.probable;
+        if node.mappings.get(1).is_some_and(equal) {
             words.push(format!("or {} more", node.mappings.len() - 1));
         }
     }
@@ -393,6 +430,12 @@ fn seen(node: &FoundNode) -> String {
     }
     if node.guard_requests > 0 {
         words.push(format!("guarded by another master{}", period(node.guarded_ms)));
+    }
+    if let Some(kind) = node.tpdo1_type.filter(|kind| *kind <= 240 && node.tpdos.is_empty()) {
+        words.push(format!("TPDO1 only after SYNC (transmission type {kind}), once started"));
+    }
+    if node.heartbeat_set_ms == Some(0) && node.error_control.is_none() {
+        words.push("no heartbeat".to_owned());
     }
     if node.boot_ups > 0 {
         words.push(format!("{} boot-up", node.boot_ups));

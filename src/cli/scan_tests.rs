@@ -165,3 +165,109 @@ fn json_survives_a_round_trip() {
 fn an_empty_bus_is_said_to_be_empty() {
     assert_eq!(report(&[]).table(), "no node was heard\n");
 }
+
+/// A scan of a bus with these devices, of which all that were there by then were started; then those `late` came.
+async fn scan_of(
+    bus: &str,
+    devices: &[(Kind, u8, &str)],
+    late: &[(Kind, u8, &str)],
+    active: bool,
+) -> ScanReport {
+    let (clock, stop) = (Clock::start(), CancellationToken::new());
+    let interface: Interface = format!("virtual:{bus}").parse().unwrap();
+    let (_heard, mut say) = virtual_bus::join(bus, clock);
+    let mut running = Vec::new();
+    for (batch, start) in [(devices, true), (late, false)] {
+        for (kind, node, scenario) in batch {
+            let device = SimOptions {
+                kind: *kind,
+                interface: interface.clone(),
+                node: NodeId::new(*node).unwrap(),
+                count: 1,
+                scenario: Some((*scenario).to_owned()),
+                seed: 1,
+            };
+            let run = sim::run(device, std::io::Cursor::new(""), std::io::sink(), clock, stop.clone());
+            running.push(tokio::spawn(run));
+        }
+        tokio::time::sleep(Duration::from_secs(2)).await;
+        if start {
+            say.send(&"000#0100".parse().unwrap()).await.unwrap();
+        }
+    }
+    let (report, _) = scan(&interface, options(active), clock, stop.clone()).await.unwrap();
+    stop.cancel();
+    for device in running {
+        device.await.unwrap().unwrap();
+    }
+    report
+}
+
+/// Node id, best mapping, whether it is sure, whether two devices are suspected.
+fn named(report: &ScanReport) -> Vec<(u8, &str, bool, bool)> {
+    let named = report.nodes.iter().map(|node| {
+        let best = node.mappings.first();
+        let (mapping, sure) = best.map_or(("", false), |best| (best.mapping.as_str(), best.probable));
+        (node.id, mapping, sure, !node.suspicions.is_empty())
+    });
+    named.collect()
+}
+
+#[tokio::test(start_paused = true)]
+async fn r_dst_001_five_seconds_of_listening_name_both_devices_as_surely_as_they_can_be() {
+    let devices = [(Kind::Detcon, 3, "quiet"), (Kind::DstP92c, 5, "demo"), (Kind::DstP92c, 6, "quiet")];
+    let report = scan_of("scan-both", &devices, &[], false).await;
+    assert_eq!(
+        named(&report),
+        [(3, "motortech-detcon", true, false), (5, "danfoss-dst-p92c", false, false)],
+        "node 6 waits for SYNC and is not heard"
+    );
+    assert!(report.table().contains("perhaps Danfoss DST P92C"), "{}", report.table());
+}
+
+#[tokio::test(start_paused = true)]
+async fn r_dst_001_who_is_asked_is_named_beyond_doubt_and_init_takes_its_mapping() {
+    let devices = [(Kind::Detcon, 3, "quiet"), (Kind::DstP92c, 5, "demo"), (Kind::DstP92c, 6, "quiet")];
+    let report = scan_of("scan-both-asked", &devices, &[], true).await;
+    assert_eq!(
+        named(&report),
+        [
+            (3, "motortech-detcon", true, false),
+            (5, "danfoss-dst-p92c", true, false),
+            (6, "danfoss-dst-p92c", true, false)
+        ]
+    );
+    assert!(report.nodes[2].mappings[0].certain);
+    let table = report.table();
+    for part in ["TPDO1 only after SYNC (transmission type 1), once started", "no heartbeat", "serial 123461"]
+    {
+        assert!(table.contains(part), "`{part}` in\n{table}");
+    }
+    let text = super::super::init::configuration(&report, "hall-1");
+    let source = crate::mapping::SourceText::new("nowhere/cangate.toml", text.as_str());
+    let none = std::io::ErrorKind::NotFound;
+    let loaded = crate::config::load(&source, [], &mut |_| Err(none.into())).unwrap();
+    let nodes: Vec<_> =
+        loaded.table.nodes.iter().map(|node| (node.name.as_str(), node.canopen.id.get())).collect();
+    assert_eq!(nodes, [("detcon-3", 3), ("dst-p92c-5", 5), ("dst-p92c-6", 6)], "{text}");
+    assert_eq!(loaded.warnings, []);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_transmitter_that_shares_the_node_id_of_a_detcon_is_told_by_what_it_says() {
+    let late = [(Kind::DstP92c, 3, "quiet")];
+    let report = scan_of("scan-clash", &[(Kind::Detcon, 3, "quiet")], &late, true).await;
+    assert_eq!(named(&report), [(3, "danfoss-dst-p92c", true, true)]);
+    let table = report.table();
+    let told = "! two devices may share node id 3: it says to be Danfoss DST P92C, but its process data are those of \
+                MOTORTECH DetCon";
+    assert!(table.contains(told), "{table}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn two_transmitters_from_their_boxes_are_told_by_their_answers() {
+    let devices = [(Kind::DstP92c, 1, "quiet"), (Kind::DstP92c, 1, "bad_sensor")];
+    let report = scan_of("scan-two", &devices, &[], true).await;
+    assert_eq!(named(&report), [(1, "danfoss-dst-p92c", true, true)]);
+    assert!(report.table().contains("requests were answered twice"), "{}", report.table());
+}

@@ -1,15 +1,21 @@
-//! Which mapping fits a node of which only frames were seen. Pure.
+//! Which mapping fits a node, by its frames and by what it says of itself. Pure.
 //!
-//! A device is recognised by what its mapping says of it, never by a rule in the program: the identifiers and lengths of its
-//! TPDOs, how its life is watched, and where the node told its name, the model. Devices without an identity object can be
-//! told apart only so; therefore an answer is a proposal, which says on what it rests.
+//! A device is recognised by what its mapping says of it, never by a rule in the program. A node that told its identity is
+//! what it says. Of others the identifiers and lengths of their TPDOs are compared, and how their life is watched: devices
+//! without an identity object can be told apart only so, therefore such an answer is a proposal.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
 
 use super::{DeviceDef, Sketch, SourceText};
 use crate::can::CanId;
-use crate::canopen::{ErrorControl, NodeId, NodeSettings};
+use crate::canopen::boot::BootStep;
+use crate::canopen::object::ObjectId;
+use crate::canopen::{ErrorControl, NodeId, NodeSettings, PdoSettings};
+
+/// Vendor id.
+const VENDOR: ObjectId = ObjectId::new(0x1018, 1);
 
 /// What was seen of a node.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -18,10 +24,14 @@ pub struct Sighting {
     pub node: NodeId,
     /// Identifiers of TPDOs that were seen, with all lengths that they had.
     pub tpdos: BTreeMap<CanId, BTreeSet<u8>>,
+    /// How long TPDOs of it were listened to: from the first to the last.
+    pub listened: Duration,
     /// Whether it told its state by itself (`true`) or when it was asked; `None`: neither was seen.
     pub heartbeat: Option<bool>,
     /// Its device name, object 0x1008, where it was read.
     pub name: Option<String>,
+    /// What was read of its device type 0x1000 and its identity 0x1018.
+    pub identity: BTreeMap<ObjectId, u32>,
 }
 
 /// How well a mapping fits.
@@ -33,6 +43,10 @@ pub enum Fit {
     /// All its regular TPDOs with their lengths, no other, and there are several; or the node's name is that of the model
     /// and nothing speaks against it.
     Probable,
+    /// The node says so itself: all that the mapping knows of its identity was read and is as it should be, its vendor and
+    /// something else among it, and its name is no other model's. What its frames look like does not count then: a device
+    /// that is still as it was shipped sends others.
+    Certain,
 }
 
 /// A mapping that fits.
@@ -44,6 +58,8 @@ pub struct Candidate {
     pub device: DeviceDef,
     /// How well.
     pub fit: Fit,
+    /// Its frames are what this device sends. Where it is not, but another candidate's are, there are two devices.
+    pub sends: bool,
 }
 
 /// The mappings that fit, the best first; of equal ones in the order given. `mappings`: name and text of each.
@@ -61,9 +77,29 @@ fn candidate(sighting: &Sighting, name: &str, text: &str) -> Option<Candidate> {
     let sketch = Sketch::new().mapping(SourceText::new(name, text));
     let (table, _) = sketch.node("seen", sighting.node.get(), name, |_| ()).build().ok()?;
     let node = table.nodes.into_iter().next()?;
-    let named = sighting.name.as_ref().is_some_and(|name| names(name, &node.device.model));
-    let fit = fit(sighting, &node.canopen, named)?;
-    Some(Candidate { mapping: name.to_owned(), device: node.device, fit })
+    let named = sighting.name.as_ref().map(|name| names(name, &node.device.model));
+    let by_frames = fit(sighting, &node.canopen, &node.device, named == Some(true));
+    let fit = match identity(&sighting.identity, &node.canopen) {
+        Some(false) => return None,
+        Some(true) if named != Some(false) => Some(Fit::Certain),
+        Some(true) => Some(Fit::Probable),
+        None => by_frames,
+    };
+    Some(Candidate { mapping: name.to_owned(), device: node.device, fit: fit?, sends: by_frames.is_some() })
+}
+
+/// Whether the node is by its identity the device that a mapping is for; `None`: that cannot be said.
+fn identity(read: &BTreeMap<ObjectId, u32>, settings: &NodeSettings) -> Option<bool> {
+    let expected = settings.boot.steps.iter().filter_map(|step| {
+        if let BootStep::Identity { object, expected } = step { Some((*object, *expected)) } else { None }
+    });
+    let expected: Vec<(ObjectId, u32)> = expected.collect();
+    if expected.iter().any(|(object, value)| read.get(object).is_some_and(|told| told != value)) {
+        return Some(false);
+    }
+    let all = expected.iter().all(|(object, _)| read.contains_key(object));
+    let vendor = expected.iter().any(|(object, _)| *object == VENDOR);
+    (all && vendor && expected.len() > 1).then_some(true)
 }
 
 /// Whether a device name holds the model: `DST P92C CANopen` holds `DST P92C`.
@@ -71,7 +107,7 @@ fn names(name: &str, model: &str) -> bool {
     !model.is_empty() && name.to_lowercase().contains(&model.to_lowercase())
 }
 
-fn fit(sighting: &Sighting, settings: &NodeSettings, named: bool) -> Option<Fit> {
+fn fit(sighting: &Sighting, settings: &NodeSettings, device: &DeviceDef, named: bool) -> Option<Fit> {
     let watched_otherwise = match (&settings.error_control, sighting.heartbeat) {
         (ErrorControl::Guarding(_), Some(heartbeat)) => heartbeat,
         // Every device answers a guard request or does not; one that was asked and answered may well send heartbeats when
@@ -80,14 +116,17 @@ fn fit(sighting: &Sighting, settings: &NodeSettings, named: bool) -> Option<Fit>
     };
     let strange = sighting.tpdos.iter().any(|(id, lengths)| {
         let known = settings.pdos.iter().find(|pdo| pdo.cob_id == *id);
-        !known.is_some_and(|pdo| lengths.iter().all(|length| fits(*length, pdo.length, pdo.strict_length)))
+        !known.is_some_and(|pdo| lengths.iter().all(|length| fits(*length, pdo, device)))
     });
-    if watched_otherwise || strange {
+    // Others come only when something happens.
+    let regular = settings.pdos.iter().filter_map(|pdo| Some((pdo.cob_id, pdo.timeout?)));
+    let missing: Vec<Duration> =
+        regular.filter(|(id, _)| !sighting.tpdos.contains_key(id)).map(|(_, timeout)| timeout).collect();
+    let overdue = missing.iter().any(|timeout| *timeout <= sighting.listened);
+    if watched_otherwise || strange || overdue {
         return None;
     }
-    // Others come only when something happens.
-    let mut regular = settings.pdos.iter().filter(|pdo| pdo.timeout.is_some());
-    let complete = regular.all(|pdo| sighting.tpdos.contains_key(&pdo.cob_id));
+    let complete = missing.is_empty();
     match (sighting.tpdos.len(), complete) {
         _ if named => Some(Fit::Probable),
         (0, _) => None,
@@ -96,9 +135,11 @@ fn fit(sighting: &Sighting, settings: &NodeSettings, named: bool) -> Option<Fit>
     }
 }
 
-/// Whether a frame of this length can be that TPDO; longer ones are padded.
-fn fits(seen: u8, length: u8, strict: bool) -> bool {
-    seen == length || seen > length && !strict
+/// Whether a frame of this length can be that TPDO: longer ones are padded, and a device that the gateway has not set up
+/// yet may send another content.
+fn fits(seen: u8, pdo: &PdoSettings, device: &DeviceDef) -> bool {
+    let shipped = device.shipped_lengths.get(&pdo.number) == Some(&seen);
+    seen == pdo.length || shipped || seen > pdo.length && !pdo.strict_length
 }
 
 #[cfg(test)]
@@ -129,7 +170,14 @@ type = "i32"
     fn sighting(node: u8, tpdos: &[(u16, &[u8])]) -> Sighting {
         let tpdos =
             tpdos.iter().map(|(id, lengths)| (CanId::Standard(*id), lengths.iter().copied().collect()));
-        Sighting { node: NodeId::new(node).unwrap(), tpdos: tpdos.collect(), heartbeat: None, name: None }
+        Sighting {
+            node: NodeId::new(node).unwrap(),
+            tpdos: tpdos.collect(),
+            listened: Duration::ZERO,
+            heartbeat: None,
+            name: None,
+            identity: BTreeMap::new(),
+        }
     }
 
     fn found(sighting: &Sighting) -> Vec<(String, Fit)> {
@@ -192,5 +240,73 @@ type = "i32"
         ] {
             assert_eq!(found(&other), [], "{other:?}");
         }
+    }
+
+    const DST: [(ObjectId, u32); 2] =
+        [(ObjectId::new(0x1000, 0), 0x0002_0194), (ObjectId::new(0x1018, 1), 0x23D)];
+
+    fn shipped(sighting: &Sighting) -> Vec<(String, Fit)> {
+        candidates(sighting, SHIPPED).into_iter().map(|found| (found.mapping, found.fit)).collect()
+    }
+
+    #[test]
+    fn r_dst_001_a_node_that_told_its_identity_is_what_it_says_whatever_it_sends() {
+        let sent: [&[(u16, &[u8])]; 4] =
+            [&[], &[(0x181, &[5])], &[(0x181, &[8])], &[(0x181, &[5, 8]), (0x281, &[8])]];
+        for tpdos in sent {
+            let told = Sighting { identity: DST.into(), ..sighting(1, tpdos) };
+            assert_eq!(shipped(&told)[0], ("danfoss-dst-p92c".to_owned(), Fit::Certain), "{tpdos:?}");
+        }
+        let named =
+            Sighting { name: Some("DST P92C CANopen".to_owned()), identity: DST.into(), ..sighting(1, &[]) };
+        assert_eq!(shipped(&named), one("danfoss-dst-p92c", Fit::Certain));
+        let sister = Sighting { name: Some("DST P110".to_owned()), ..named };
+        assert_eq!(shipped(&sister), one("danfoss-dst-p92c", Fit::Probable));
+    }
+
+    #[test]
+    fn r_dst_001_a_node_that_says_to_be_another_is_no_dst_and_a_part_of_an_identity_proves_nothing() {
+        let other = Sighting { identity: [DST[0], (VENDOR, 0x23E)].into(), ..sighting(1, &[(0x181, &[5])]) };
+        assert_eq!(shipped(&other), []);
+        let part = Sighting { identity: [DST[1]].into(), ..sighting(1, &[]) };
+        assert_eq!(shipped(&part), []);
+    }
+
+    #[test]
+    fn a_transmitter_as_shipped_or_set_up_is_perhaps_one_and_with_other_lengths_none() {
+        let perhaps = one("danfoss-dst-p92c", Fit::Possible);
+        let heard = |length: u8| Sighting {
+            listened: Duration::from_secs(5),
+            heartbeat: Some(true),
+            ..sighting(5, &[(0x185, &[length])])
+        };
+        assert_eq!((shipped(&heard(5)), shipped(&heard(8))), (perhaps.clone(), perhaps));
+        assert_eq!(shipped(&heard(3)), []);
+    }
+
+    #[test]
+    fn a_device_whose_other_tpdos_never_came_in_all_that_time_is_another_device() {
+        let alone = |listened| Sighting { listened, ..sighting(3, &DETCON[..1]) };
+        assert_eq!(found(&alone(Duration::from_millis(1400))), one("motortech-detcon", Fit::Possible));
+        assert_eq!(found(&alone(Duration::from_secs(5))), []);
+    }
+
+    #[test]
+    fn a_device_that_says_to_be_one_and_sends_like_another_is_two() {
+        let both = Sighting {
+            identity: DST.into(),
+            ..sighting(1, &[(0x181, &[8]), (0x281, &[8]), (0x381, &[8]), (0x481, &[6])])
+        };
+        let found: Vec<_> = candidates(&both, SHIPPED)
+            .into_iter()
+            .map(|found| (found.mapping, found.fit, found.sends))
+            .collect();
+        assert_eq!(
+            found,
+            [
+                ("danfoss-dst-p92c".to_owned(), Fit::Certain, false),
+                ("motortech-detcon".to_owned(), Fit::Probable, true)
+            ]
+        );
     }
 }

@@ -37,17 +37,18 @@ use std::time::Duration;
 use crate::canopen::NodeId;
 use detcon::DetconSettings;
 
-/// The devices of `cangate demo`: node 1 at an engine of 16 cylinders, node 2 at one of 12. Both tell the same story, the
-/// second half a minute later, so that something goes on most of the time.
+/// The devices of `cangate demo`: node 1 at an engine of 16 cylinders, node 2 at one of 12, and node 5 at a press. Both
+/// engines tell the same story, the second half a minute later, so that something goes on most of the time.
 #[must_use]
 pub fn demo() -> Vec<DevicePlan> {
-    let Some(scenario) = Scenario::shipped(Kind::Detcon, "demo") else { return Vec::new() };
-    [(1, 16, Duration::ZERO), (2, 12, Duration::from_secs(30))]
-        .into_iter()
-        .filter_map(|(node, cylinders, story_after)| {
-            let settings = Settings::Detcon(DetconSettings { cylinders, ..DetconSettings::default() });
-            let scenario = Scenario { settings, ..scenario.clone() };
-            Some(DevicePlan { story_after, ..DevicePlan::new(NodeId::new(node)?, scenario) })
-        })
-        .collect()
+    let story = |kind| Scenario::shipped(kind, "demo");
+    let (Some(engine), Some(press)) = (story(Kind::Detcon), story(Kind::DstP92c)) else { return Vec::new() };
+    let engines = [(1, 16, Duration::ZERO), (2, 12, Duration::from_secs(30))];
+    let engines = engines.into_iter().filter_map(|(node, cylinders, story_after)| {
+        let settings = Settings::Detcon(DetconSettings { cylinders, ..DetconSettings::default() });
+        let scenario = Scenario { settings, ..engine.clone() };
+        Some(DevicePlan { story_after, ..DevicePlan::new(NodeId::new(node)?, scenario) })
+    });
+    let press = NodeId::new(5).map(|node| DevicePlan::new(node, press.clone()));
+    engines.chain(press).collect()
 }

@@ -10,8 +10,7 @@ mod signs;
 
 use std::time::Duration;
 
-pub(super) use answers::Answers;
-use answers::Extra;
+pub(super) use answers::{Answers, Extra};
 use signs::{Alternation, BootUps, Rate};
 
 use super::{PdoIndex, PdoSettings};
@@ -219,6 +218,11 @@ impl Duplicate {
     /// An emergency message by which the device itself says that somebody uses its identifiers.
     pub(super) fn handle_collision(&mut self, now: Instant) -> Option<&'static str> {
         self.suspect(now, "the device reports that its identifiers collide, EMCY 0x8150")
+    }
+
+    /// A TPDO in the node's name that the node does not have.
+    pub(super) fn handle_strange_tpdo(&mut self, now: Instant) -> Option<&'static str> {
+        self.suspect(now, "a TPDO comes that this device does not have")
     }
 
     /// What became due: new evidence, and whether the suspicion has ended.

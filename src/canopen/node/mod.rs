@@ -2,10 +2,12 @@
 //!
 //! This file joins the machines and runs their clocks.
 //!
-//! - `watch`: how its life is watched. `reception`: what its frames mean. `transfers`: what it is asked by SDO. `supply`:
+//! - `watch`: how its life is watched. `reception`: what its frames mean. `transfers`: what it is asked by SDO.
+//! - `strange`: TPDOs in its name that its mapping does not have. `supply`:
 //!   what it is sent in RPDOs.
 
 mod reception;
+mod strange;
 mod supply;
 mod transfers;
 mod watch;
@@ -24,6 +26,8 @@ use super::start::Start;
 use super::{NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex, Role, cob_id};
 use crate::can::{CanFrame, CanId};
 use crate::time::Instant;
+use strange::Strange;
+pub(super) use strange::predefined_tpdo;
 use watch::Watch;
 
 /// A boot-up message this long after an ordered reset was ordered too; slow devices take seconds.
@@ -46,6 +50,7 @@ pub(super) struct Node {
     /// A frame of it came since the bus can be used.
     heard: bool,
     pub(super) duplicate: Duplicate,
+    strange: Strange,
     /// Started by nobody: its TPDOs may follow its boot-up message at once.
     pub(super) self_starting: bool,
     /// The believed state; `None` before the first sign.
@@ -103,6 +108,7 @@ impl Node {
             polls: Polls::new(settings.polls),
             moved: Vec::new(),
             duplicate: Duplicate::new(&settings.pdos),
+            strange: Strange::default(),
             pdos: Pdos::new(settings.pdos),
             rpdos: Rpdos::new(settings.rpdos),
             heard: false,

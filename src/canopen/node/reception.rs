@@ -11,6 +11,7 @@ use super::super::pdo::Length;
 use super::super::start::{STORM_WAIT, Start};
 use super::super::{NmtRequest, NmtState, NodeEvent, PdoIndex};
 use super::Node;
+use super::strange::Strange;
 use super::watch::Watch;
 use crate::can::{CanFrame, CanId};
 use crate::time::Instant;
@@ -80,6 +81,7 @@ impl Node {
             guarding.ask_after_boot_up(now);
         }
         self.duplicate.handle_boot_up(now, self.self_starting);
+        self.strange = Strange::default();
         let expected = self.reset_until.take().is_some_and(|until| now <= until);
         if single && !reply {
             self.duplicate.count_boot_up(now, expected);

@@ -85,7 +85,11 @@ impl Node {
                             outputs.node(self.id, NodeEvent::Polled { poll, result });
                         }
                     }
-                    SdoOutput::Done(id, result) => outputs.node(self.id, NodeEvent::Sdo { id, result }),
+                    SdoOutput::Done(id, result) => {
+                        if !self.handle_strange_answer(id, &result) {
+                            outputs.node(self.id, NodeEvent::Sdo { id, result });
+                        }
+                    }
                 }
             } else {
                 return;

@@ -93,7 +93,7 @@ pub fn build(installation: &Installation<'_>) -> Result<(TagTable, Vec<Diagnosti
         claims: Vec::new(),
     };
     for (index, bus) in builder.table.buses.iter().enumerate() {
-        builder.taken.broadcasts(BusIndex(index), bus);
+        builder.taken.broadcasts(&mut problems, installation, BusIndex(index), bus);
     }
     for (name, entry) in installation.nodes {
         builder.node(&mut problems, &files, name, entry);
@@ -271,7 +271,7 @@ impl Builder<'_> {
         self.claims.push(addresses::of_node(problems, context, name, unit_id, &tags, &places));
         sync::check_changes(problems, context);
         let canopen = node::settings(problems, context, id);
-        self.taken.identifiers(problems, self.installation.config, name, bus, &canopen);
+        self.taken.identifiers(problems, self.installation, name, bus, &canopen);
         let base = self.table.alarms.len();
         let alarms = alarms::of_node(problems, context, &canopen.pdos, &places, bus, base);
         let (device, entry) = (&context.file.device, context.entry);
@@ -284,6 +284,7 @@ impl Builder<'_> {
                 vendor: device.vendor.clone(),
                 model: device.model.clone(),
                 description: device.description.clone(),
+                shipped_lengths: node::shipped_lengths(problems, context),
             },
             unit_id: u8::try_from(unit_id).unwrap_or(1),
             offset: entry.offset.as_ref().and_then(|offset| u16::try_from(offset.value).ok()).unwrap_or(0),

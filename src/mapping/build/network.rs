@@ -1,6 +1,7 @@
 //! Node ids and identifiers: what no two nodes of a bus may share.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 
 use super::super::installation::NodeEntry;
 use super::super::table::BusDef;
@@ -8,6 +9,7 @@ use super::super::{At, SourceText};
 use super::Installation;
 use super::problems::Problems;
 use crate::can::{BusIndex, CanId};
+use crate::canopen::sdo::request_id;
 use crate::canopen::{NodeSettings, cob_id};
 
 /// Identifiers that CiA 301 keeps for other things than PDOs.
@@ -25,7 +27,8 @@ const RESTRICTED: [(u32, u32, &str); 7] = [
 #[derive(Debug, Default)]
 pub struct Taken {
     node_ids: BTreeMap<(BusIndex, u64), String>,
-    identifiers: BTreeMap<(BusIndex, CanId), String>,
+    /// With the line in which the owner stands.
+    identifiers: BTreeMap<(BusIndex, CanId), (String, usize)>,
     /// Nodes whose bus or id is wrong: what follows from that for their identifiers needs no telling.
     ignored: BTreeSet<String>,
 }
@@ -62,52 +65,103 @@ impl Taken {
         self.ignored.insert(name.value.clone());
     }
 
-    /// The identifiers of SYNC and of TIME, where the configuration tells of them.
-    pub fn broadcasts(&mut self, index: BusIndex, bus: &BusDef) {
-        let sync = bus.sync.map(|sync| ("SYNC", sync.cob_id));
-        let time = bus.time.map(|time| ("TIME", time.cob_id));
-        for (what, id) in sync.into_iter().chain(time) {
-            self.identifiers.insert((index, id), format!("{what} of bus `{}`", bus.name));
+    /// The identifiers of SYNC and of TIME: as the configuration tells, else as everybody knows them.
+    pub fn broadcasts(
+        &mut self,
+        problems: &mut Problems,
+        installation: &Installation<'_>,
+        index: BusIndex,
+        bus: &BusDef,
+    ) {
+        let entry = installation.buses.iter().nth(index.0);
+        let at = |span: Option<&Range<usize>>| span.or(entry.map(|(name, _)| &name.span)).cloned();
+        let spans = [
+            at(entry.and_then(|(_, entry)| entry.sync.as_ref()).map(|sync| &sync.span)),
+            at(entry.and_then(|(_, entry)| entry.time.as_ref()).map(|time| &time.span)),
+        ];
+        let sync = ("SYNC", bus.sync.map_or(cob_id::SYNC, |sync| sync.cob_id));
+        let time = ("TIME", bus.time.map_or(cob_id::TIME, |time| time.cob_id));
+        for ((what, id), span) in [sync, time].into_iter().zip(spans) {
+            let owner = format!("{what} of bus `{}`", bus.name);
+            self.claim(problems, installation.config, index, id, owner, &span.unwrap_or_default());
         }
     }
 
-    /// An identifier must have one sender on its bus.
+    /// An identifier must have one sender on its bus (R-DET-004). All of a node's are looked at, though only those of its
+    /// PDOs can be chosen.
     pub fn identifiers(
         &mut self,
         problems: &mut Problems,
-        config: &SourceText,
+        installation: &Installation<'_>,
         name: &At<String>,
         bus: BusIndex,
         settings: &NodeSettings,
     ) {
-        let mut all = vec![("emergency".to_owned(), cob_id::emcy(settings.id))];
+        if self.ignored.contains(&name.value) {
+            return;
+        }
+        let (config, node, id) = (installation.config, &name.value, settings.id);
+        for (what, id) in [
+            ("emergency", cob_id::emcy(id)),
+            ("SDO answers", cob_id::sdo_answer(id)),
+            ("SDO requests", request_id(id)),
+            ("heartbeat and guarding", cob_id::error_control(id)),
+        ] {
+            let owner = format!("{what} of node `{node}`");
+            self.claim(problems, config, bus, id, owner, &name.span);
+        }
         let tpdos = settings.pdos.iter().map(|pdo| (format!("TPDO {}", pdo.number), pdo.cob_id));
         let rpdos = settings.rpdos.iter().map(|pdo| (format!("RPDO {}", pdo.number), pdo.cob_id));
-        for (what, cob_id) in tpdos.chain(rpdos) {
-            if let Some(purpose) = restricted(cob_id) {
-                let message = format!(
-                    "{what} of node `{}` has identifier {cob_id}, which is kept for {purpose}",
-                    name.value
-                );
-                problems.error(config, &name.span, message, "check `cob_id` in the mapping");
-            }
-            all.push((what, cob_id));
-        }
-        for (what, id) in all {
-            let owner = format!("{what} of node `{}`", name.value);
-            if self.ignored.contains(&name.value) {
+        for (what, id) in tpdos.chain(rpdos) {
+            let owner = format!("{what} of node `{node}`");
+            let Some(purpose) = restricted(id) else {
+                self.claim(problems, config, bus, id, owner, &name.span);
                 continue;
-            }
-            let Some(other) = self.identifiers.insert((bus, id), owner.clone()) else { continue };
-            let message = format!("{other} and {owner} have the same identifier {id}");
-            problems.error(
-                config,
-                &name.span,
-                message,
-                "every identifier has one sender: check `cob_id` in the mappings",
-            );
+            };
+            let whose = other_node(installation, name, bus, id);
+            let whose = whose.map_or_else(String::new, |other| format!(", here of node `{other}`"));
+            let message = format!("{owner} has identifier {id}, which is kept for {purpose}{whose}");
+            problems.error(config, &name.span, message, "check `cob_id` in the mapping");
         }
     }
+
+    fn claim(
+        &mut self,
+        problems: &mut Problems,
+        config: &SourceText,
+        bus: BusIndex,
+        id: CanId,
+        owner: String,
+        span: &Range<usize>,
+    ) {
+        let (line, _) = config.position(span.start);
+        let Some((other, other_line)) = self.identifiers.get(&(bus, id)) else {
+            self.identifiers.insert((bus, id), (owner, line));
+            return;
+        };
+        let elsewhere = if *other_line == line { String::new() } else { format!(" (line {other_line})") };
+        let message = format!("{other}{elsewhere} and {owner} have the same identifier {id}");
+        let hint = "every identifier has one sender on its bus: check the `cob_id` of both, in the configuration and in \
+                    the mappings";
+        problems.error(config, span, message, hint);
+    }
+}
+
+/// The other node of a bus whose id is in an identifier that is kept for a service of nodes.
+fn other_node<'a>(
+    installation: &'a Installation<'_>,
+    name: &At<String>,
+    bus: BusIndex,
+    id: CanId,
+) -> Option<&'a str> {
+    let CanId::Standard(number) = id else { return None };
+    let bus = installation.buses.keys().nth(bus.0)?;
+    let is_service = matches!(number >> 7, 0xB | 0xC | 0xE);
+    let mut nodes = installation.nodes.iter();
+    let (other, _) = nodes.find(|(_, entry)| {
+        is_service && entry.bus.value == bus.value && entry.id.value == u64::from(number & 0x7F)
+    })?;
+    (other.value != name.value).then_some(other.value.as_str())
 }
 
 /// What an identifier is kept for, so that it can be no PDO's.

@@ -1,5 +1,6 @@
 //! What the CANopen master needs to know of a node: from the mapping, changed by the installation.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use super::super::At;
@@ -282,6 +283,16 @@ pub fn checked_length(problems: &mut Problems, source: &SourceText, frame: &Fram
         return 8;
     };
     problems.within(source, &At { value: length, span: span.clone() }, "length", 1..=8)
+}
+
+/// What TPDOs have in a device as it is shipped.
+pub fn shipped_lengths(problems: &mut Problems, context: &Context<'_>) -> BTreeMap<u16, u8> {
+    let lengths = context.tpdos.iter().filter_map(|tpdo| {
+        let at = tpdo.section.shipped_length.as_ref()?;
+        let length = problems.within(context.source, at, "shipped_length", 1..=8);
+        Some((u16::try_from(tpdo.number).ok()?, u8::try_from(length).ok()?))
+    });
+    lengths.collect()
 }
 
 /// `0x6130:1/32`.

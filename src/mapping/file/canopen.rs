@@ -64,6 +64,8 @@ pub struct TpdoSection {
     /// What it carries, in order, each `"0xINDEX:SUB/BITS"`, for example `"0x6130:1/32"`.
     #[serde(default)]
     pub maps: Vec<At<String>>,
+    /// Bytes that it has in a device as it is shipped, 1..=8, where that differs: only for recognising it.
+    pub shipped_length: Option<At<u64>>,
     /// What is done where the node has another mapping. Default: write; without `maps` nothing is read or written.
     #[serde(default)]
     pub mapping: MappingWord,

@@ -11,6 +11,7 @@ mod derived;
 mod device_unit;
 mod tag;
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::time::Duration;
 
@@ -142,6 +143,8 @@ pub struct DeviceDef {
     pub model: String,
     /// One sentence.
     pub description: String,
+    /// By TPDO number: bytes that it has in a device as it is shipped, where the gateway gives it another content.
+    pub shipped_lengths: BTreeMap<u16, u8>,
 }
 
 /// How often the state topic of a node is published.
