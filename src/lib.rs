@@ -20,7 +20,7 @@
 //! | [`time`] | the clock | nothing |
 //! | [`can`] | frames, buses | time |
 //! | [`canopen`] | the CANopen master, pure | `can::frame`, time |
-//! | [`process_image`] | values, quality, status, journal | time, the word `canopen::NmtState` |
+//! | [`process_image`] | values, quality, status, journal | time, the words `canopen::NmtState` and `canopen::emcy` |
 //! | [`mapping`] | what bytes mean; the tag table | `process_image`, canopen ids and settings, `can::BusIndex`, bit rates |
 //! | [`alarms`] | the alarm list, pure | `process_image`, time |
 //! | [`gateway`] | joins the above, pure but for its task | can, canopen, `process_image`, mapping, alarms, time |

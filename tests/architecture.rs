@@ -9,7 +9,7 @@ const MAY_IMPORT: &[(&str, &[&str])] = &[
     ("time", &[]),
     ("can", &["time"]),
     ("canopen", &["can::frame", "can::CanFrame", "can::CanId", "time"]),
-    ("process_image", &["time", "canopen::NmtState"]),
+    ("process_image", &["time", "canopen::NmtState", "canopen::emcy"]),
     (
         "mapping",
         &[

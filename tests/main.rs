@@ -6,6 +6,7 @@
 //! | `conversations` | the gateway core against scripted frames, in candump notation |
 //! | `devices` | the gateway core against our simulators, with loss, delay and duplicates |
 //! | `neighbours` | the gateway beside a second device of the same node id, and beside healthy ones |
+//! | `emergencies` | errors that devices tell of: alarms, tags, what is read at the start, storms |
 //! | `eds` | EDS and DCF files of any quality become mappings; an import moves nothing that it gave away |
 //! | `clashes` | identifiers that two participants of a bus would send |
 //! | `mappings` | every shipped mapping checks; every message about a wrong one says what, where and how to mend it |
@@ -52,6 +53,7 @@ mod conversations;
 mod devices;
 mod documents;
 mod eds;
+mod emergencies;
 mod lifecycle;
 mod mappings;
 mod modbus_server;

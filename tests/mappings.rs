@@ -213,7 +213,11 @@ fn an_installation_changes_what_it_may() {
     let tag = |name: &str| table.tag(table.find_tag(NodeIndex(0), name).unwrap()).unwrap();
     let field = |name: &str| match tag(name).source {
         Source::Pdo { field, .. } => field,
-        Source::Derived(_) | Source::Polled { .. } | Source::Adopted { .. } | Source::Rpdo { .. } => {
+        Source::Derived(_)
+        | Source::Polled { .. }
+        | Source::Adopted { .. }
+        | Source::Rpdo { .. }
+        | Source::Emergency { .. } => {
             panic!("{name}")
         }
     };

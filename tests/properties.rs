@@ -119,8 +119,11 @@ fn nothing_old_is_good(conversation: &Conversation) {
         let node = table.node(def.node).unwrap();
         let bus = image.buses[node.bus.0].state;
         match &def.source {
-            Source::Polled { .. } | Source::Adopted { .. } | Source::Rpdo { .. } => {
-                unreachable!("a DetCon knows no SDO and no RPDO")
+            Source::Polled { .. }
+            | Source::Adopted { .. }
+            | Source::Rpdo { .. }
+            | Source::Emergency { .. } => {
+                unreachable!("a DetCon knows no SDO, no RPDO and no emergency messages")
             }
             Source::Pdo { pdo, .. } => {
                 let down = matches!(bus, BusState::Absent | BusState::Down | BusState::BusOff);

@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use cangate::canopen::emcy::Emergency;
 use cangate::process_image::handles::process_image;
 use cangate::process_image::{
     AlarmState, AlarmStatus, ImageWriter, ProcessImage, Quality, Reason, Revision, Sample, Value,
@@ -184,6 +185,34 @@ async fn what_the_interface_says_is_as_its_description_promises() {
         promised.sort();
         assert_eq!(said, promised, "{name}");
     }
+}
+
+#[tokio::test]
+async fn r_dst_078_a_node_shows_its_errors_and_those_that_were() {
+    let mut web = Web::start().await;
+    web.change(|image| {
+        for (millis, data) in
+            [(1, [0x11, 0xF0, 0x21, 1]), (2, [0x11, 0xF0, 0x21, 1]), (3, [0x00, 0x40, 0x29, 0])]
+        {
+            let emergency = Emergency::decode(&data).unwrap();
+            image.nodes[0].errors.handle_message(plant::at(millis).utc, emergency, None);
+        }
+    });
+    let errors = &web.get("/api/v1/nodes/engine1").await.json()["errors"];
+    let first = json!({
+        "ts": plant::at(1).utc.as_millis(), "code": "0xF011", "meaning": "additional functions", "name": null,
+        "register": 0x21, "vendor": "0100000000", "count": 2,
+    });
+    assert_eq!(errors["active"][0], first);
+    let codes = |list: &str| -> Vec<Json> {
+        errors[list].as_array().unwrap().iter().map(|error| error["code"].clone()).collect()
+    };
+    assert_eq!(codes("active"), ["0xF011", "0x4000"]);
+    assert_eq!(codes("history"), ["0x4000", "0xF011"]);
+    let openapi: Json = serde_json::from_str(OPENAPI).unwrap();
+    let mut schema = json!({"type": "array", "items": {"$ref": "#/components/schemas/DeviceError"}});
+    schema["components"] = openapi["components"].clone();
+    assert!(jsonschema::validator_for(&schema).unwrap().is_valid(&errors["active"]));
 }
 
 #[tokio::test]

@@ -179,6 +179,8 @@ pub enum NodeEvent {
         /// Manufacturer bytes.
         vendor: [u8; 5],
     },
+    /// It booted: the errors that its emergency messages told of before are over. Only where there was one.
+    ErrorsForgotten,
     /// Two nodes seem to share this id; told once for each kind of evidence until `DuplicateCleared`.
     DuplicateSuspected {
         /// What was seen.

@@ -15,6 +15,7 @@
 //! - [`census`], [`probe`]: who is on a bus, by listening and by asking; for tools.
 //! - [`well_known`]: names and types of the objects that CiA 301 defines.
 //! - [`event`]: what a network tells.
+//! - [`emcy`]: emergency messages, and the errors that they tell of.
 //! - [`boot`]: what is done with a node before it is started.
 //! - [`polls`]: objects that are read again and again.
 //! - `guarding`, `heartbeat`, `start`, `pdo`, `rpdo`, `duplicate`: one machine each, for one node.
@@ -28,6 +29,7 @@ mod broadcasts;
 pub mod census;
 pub mod cob_id;
 mod duplicate;
+pub mod emcy;
 pub mod event;
 mod guarding;
 mod heartbeat;

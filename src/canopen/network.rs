@@ -124,7 +124,8 @@ impl Network {
                 continue;
             }
             network.claim(error_control, Slot::ErrorControl(place));
-            network.claim(cob_id::emcy(node.id), Slot::Emergency(place));
+            let emergency = node.emergency.unwrap_or_else(|| cob_id::emcy(node.id));
+            network.claim(emergency, Slot::Emergency(place));
             if node.sdo.is_some() {
                 network.claim(cob_id::sdo_answer(node.id), Slot::SdoAnswer(place));
             }

@@ -79,6 +79,8 @@ pub struct NodeSettings {
     pub pdos: Vec<PdoSettings>,
     /// The RPDOs that it is sent; [`RpdoIndex`] counts in it. None unless the configuration allows it.
     pub rpdos: Vec<RpdoSettings>,
+    /// Identifier of its emergency messages, node id already added; `None`: 0x080 + id, as CiA 301 predefines it.
+    pub emergency: Option<CanId>,
     /// How long after the start of the gateway a node that showed no frame at all is reported (R-DET-001).
     pub never_seen_after: Duration,
 }

@@ -6,6 +6,7 @@ use super::Gateway;
 use super::node::BootTrouble;
 use super::tags::CarrierIndex;
 use super::units::{Finding, What};
+use crate::can::CanId;
 use crate::canopen::boot::{BootEvent, BootFailure, MappedPdo};
 use crate::canopen::object::ObjectId;
 use crate::canopen::sdo::SdoError;
@@ -33,6 +34,7 @@ impl Gateway {
                     event.text = format!("TPDO{number} is otherwise in the device than in its mapping file");
                 });
             }
+            BootEvent::Errors { register, code } => self.errors_read(at, *register, *code),
             BootEvent::Begun => self.withhold(at.1),
             BootEvent::Mapped(mapped) => self.mapped(at, mapped),
             BootEvent::RpdoMapped(mapped) => self.rpdo_mapped(at, mapped),
@@ -124,14 +126,16 @@ impl Gateway {
         }
     }
 
-    /// Emergency messages with another identifier than that of CiA 301 are told of (R-DST-119).
+    /// Emergency messages with another identifier than that of the mapping, or of CiA 301, are told of (R-DST-119).
     fn tell_of_emergency_id(&mut self, at: (Now, NodeIndex), data: Option<&[u8]>) {
         let Some(def) = self.table.nodes.get(at.1.0) else { return };
-        let expected = cob_id::emcy(def.canopen.id);
+        let settings = &def.canopen;
+        let expected = settings.emergency.unwrap_or_else(|| cob_id::emcy(settings.id));
         let Some(found) = data.and_then(|data| <[u8; 4]>::try_from(data).ok()).map(u32::from_le_bytes) else {
             return;
         };
-        if expected.raw() != found {
+        let frame = if matches!(expected, CanId::Extended(_)) { 1 << 29 } else { 0 };
+        if expected.raw() | frame != found {
             self.tell(at, "emergency_id_differs", |event| {
                 event.text = format!(
                     "the device has 0x{found:X} in {EMERGENCY_ID} for its emergency messages, not {expected}: they are not \
@@ -206,6 +210,9 @@ impl Gateway {
     /// An object that is polled was read, or could not be.
     pub(super) fn polled(&mut self, at: (Now, NodeIndex), poll: usize, result: &Result<Vec<u8>, SdoError>) {
         let (now, index) = at;
+        if self.register_polled(at, poll, result) {
+            return;
+        }
         let (Some(def), Some(node)) = (self.table.nodes.get(index.0), self.nodes.get(index.0)) else {
             return;
         };

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use crate::alarms::{AlarmList, AlarmSpec, Transition};
 use crate::mapping::expression::{Comparison, Operand};
 use crate::mapping::{AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, Derived, Expression, Source, TagTable};
-use crate::process_image::{AlarmIndex, AlarmStatus, Revision, Sample, TagIndex};
+use crate::process_image::{AlarmIndex, AlarmStatus, Revision, Sample, TagIndex, Value};
 use crate::time::{Instant, Now};
 
 use super::marks::Marks;
@@ -64,12 +64,28 @@ impl Conditions {
 
     /// A condition that the gateway watches begins or ends. Nothing where the table has no such alarm.
     pub(super) fn set(&mut self, now: Now, owner: AlarmOwner, condition: BuiltIn, holds: bool) {
+        self.decided(now, owner, condition, holds, None);
+    }
+
+    /// The same for a condition that holds while there is a value, which is shown with its alarm.
+    pub(super) fn set_with(&mut self, now: Now, owner: AlarmOwner, condition: BuiltIn, value: Option<Value>) {
+        self.decided(now, owner, condition, value.is_some(), value);
+    }
+
+    fn decided(
+        &mut self,
+        now: Now,
+        owner: AlarmOwner,
+        condition: BuiltIn,
+        holds: bool,
+        value: Option<Value>,
+    ) {
         let Some(alarm) = self.built_in.get(&(owner, condition)).copied() else { return };
         if let Some(held) = self.holds.get_mut(alarm.0)
             && *held != holds
         {
             *held = holds;
-            self.list.set_condition(now, alarm, holds, None);
+            self.list.set_condition(now, alarm, holds, value);
         }
     }
 
@@ -176,7 +192,8 @@ fn counted(table: &TagTable, tag: TagIndex) -> &[TagIndex] {
             | Source::Pdo { .. }
             | Source::Polled { .. }
             | Source::Adopted { .. }
-            | Source::Rpdo { .. },
+            | Source::Rpdo { .. }
+            | Source::Emergency { .. },
         )
         | None => &[],
     }

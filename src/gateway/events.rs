@@ -84,8 +84,12 @@ impl EventLog {
     /// An alarm changed its state. Never folded: delays and latching already hold back what flutters.
     pub(super) fn record_transition(&mut self, transition: &Transition) {
         let Some(alarm) = self.table.alarms.get(transition.alarm.0) else { return };
-        let (name, owner, text, priority) =
-            (alarm.name.clone(), alarm.owner, alarm.text.clone(), alarm.priority);
+        let (name, owner, text, priority) = (
+            alarm.name.clone(),
+            alarm.owner,
+            alarm.told(transition.status.value).into_owned(),
+            alarm.priority,
+        );
         self.push(transition.at, owner, Name::Word(""), |event| {
             event.kind = EventKind::Alarm;
             event.name = name;

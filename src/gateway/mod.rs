@@ -5,7 +5,7 @@
 //!
 //! - [`command`]: what a northbound can ask for. `operate`: what comes of it.
 //! - `core`: the four verbs.
-//! - `bus`: one bus; `node` and `node_event`: one node.
+//! - `bus`: one bus; `node` and `node_event`: one node; `emergency`: its errors.
 //! - `supply`: what nodes are sent in RPDOs.
 //! - `tags`: the value of every tag; `derived`: computed tags; `units`: units that devices tell.
 //! - `conditions`: what raises alarms. `events`: on the way to the journal.
@@ -19,6 +19,7 @@ pub mod command;
 mod conditions;
 pub mod core;
 mod derived;
+mod emergency;
 mod events;
 #[cfg(test)]
 mod fixture;

@@ -46,6 +46,10 @@ pub(super) struct Node {
     pub(super) recovered_at: Option<Instant>,
     /// Nothing came since the data of all its supervised TPDOs became too old, and nothing else watches it.
     pub(super) fell_silent: bool,
+    /// It is asked at every boot what is wrong with it.
+    pub(super) asked_about_errors: bool,
+    /// When its last emergency message came.
+    pub(super) last_emergency: Option<Instant>,
     /// By TPDO.
     pub(super) watches: Vec<PdoWatch>,
 }
@@ -118,6 +122,8 @@ impl Node {
             missing_since: None,
             recovered_at: None,
             fell_silent: false,
+            asked_about_errors: !passive && def.canopen.boot.asks_about_errors(),
+            last_emergency: None,
             watches: pdos
                 .iter()
                 .enumerate()
@@ -197,6 +203,10 @@ impl Node {
                 "no frame from node {id} since the gateway started; possible causes: power or cable, the device is \
                  not in its CANopen mode, another node id, another bit rate"
             );
+        }
+        // It answers, but is given no heartbeat: that it is lost says less.
+        if let Some(BootTrouble::OtherDevice(why)) = self.boot_trouble.as_ref().filter(|_| self.contact) {
+            return format!("not started: {why}");
         }
         match self.lost {
             Some(Loss::StuckToggle) => {
@@ -287,10 +297,12 @@ impl Gateway {
         // A node that never was there was not lost: that has an alarm of its own, which names other causes.
         let (lost, never_seen) = (node.lost.is_some() && node.ever_seen, node.never_seen);
         let boot_failed = node.contact && node.boot_trouble.is_some();
+        let other_device = node.contact && matches!(node.boot_trouble, Some(BootTrouble::OtherDevice(_)));
         let start_failed = node.start_failed.is_some() || node.start_held_back || boot_failed;
         let (duplicate, foreign_guard) = (node.duplicate.is_some(), node.foreign_guard);
         self.raise(now, owner, BuiltIn::NodeLost, lost, undecided_until);
         self.raise(now, owner, BuiltIn::NodeNeverSeen, never_seen, undecided_until);
+        self.conditions.set(now, owner, BuiltIn::IdentityMismatch, other_device);
         self.conditions.set(now, owner, BuiltIn::NotOperational, start_failed);
         self.conditions.set(now, owner, BuiltIn::DuplicateNode, duplicate);
         self.conditions.set(now, owner, BuiltIn::ForeignGuardMaster, foreign_guard);

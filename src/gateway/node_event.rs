@@ -45,11 +45,7 @@ impl Gateway {
             NodeEvent::State { from, to, ordered } => self.state(at, from, to, ordered),
             NodeEvent::Restarted => self.restarted(at),
             NodeEvent::InvalidState { raw } => self.invalid_state(at, raw),
-            NodeEvent::UnsolicitedState => {
-                self.tell(at, "unsolicited_state", |event| {
-                    event.text = "the node told its state though nobody had asked".into();
-                });
-            }
+            NodeEvent::UnsolicitedState => self.unsolicited_state(at),
             NodeEvent::GuardMissed { consecutive } => self.guard_missed(at, consecutive),
             NodeEvent::ToggleError { consecutive } => self.toggle_error(at, consecutive),
             NodeEvent::Lost { stuck_toggle } => self.lost(at, stuck_toggle),
@@ -81,20 +77,17 @@ impl Gateway {
                     node.duplicate = None;
                     node.watches.iter_mut().for_each(|watch| watch.told_apart = false);
                 });
+                self.show_errors(now, index);
                 self.tell(at, "duplicate_node_cleared", |_| ());
             }
             NodeEvent::NmtSent { request } => self.nmt_sent(at, request),
-            NodeEvent::StartFailed { attempts } => {
-                self.change(index, |node| node.start_failed = Some(attempts));
-                self.tell(at, "node_start_failed", |event| {
-                    event.text = format!("{attempts} start commands had no effect");
-                });
-            }
+            NodeEvent::StartFailed { attempts } => self.start_failed(at, attempts),
             NodeEvent::StartSucceeded => {
                 self.change(index, |node| node.start_failed = None);
                 self.tell(at, "node_start_succeeded", |_| ());
             }
             NodeEvent::Emergency { code, register, vendor } => self.emergency(at, code, register, vendor),
+            NodeEvent::ErrorsForgotten => self.errors_forgotten(at),
         }
         self.refresh_node(now, index);
     }
@@ -106,7 +99,11 @@ impl Gateway {
         node.ever_seen = true;
         self.dirty_nodes.mark(index.0);
         let fell_silent = std::mem::take(&mut node.fell_silent);
-        if !self.make_contact(index) || fell_silent {
+        let had_contact = self.make_contact(index);
+        if !had_contact {
+            self.show_errors_unasked(now, index);
+        }
+        if !had_contact || fell_silent {
             self.refresh_node(now, index);
         }
     }
@@ -261,6 +258,9 @@ impl Gateway {
                 node.clear_stale_pdos();
             }
         });
+        if to == NmtState::Initialising {
+            self.show_errors_unasked(now, index);
+        }
         if !operational {
             // Objects are read in other states too.
             let pdos = self.table.nodes.get(index.0).map_or(0, |def| def.canopen.pdos.len());
@@ -297,6 +297,19 @@ impl Gateway {
             event.value = Some(Value::Unsigned(raw.into()));
             event.to = raw.to_string();
             event.text = format!("the node reports state {raw}, which CiA 301 does not define");
+        });
+    }
+
+    fn unsolicited_state(&mut self, at: (Now, NodeIndex)) {
+        self.tell(at, "unsolicited_state", |event| {
+            event.text = "the node told its state though nobody had asked".into();
+        });
+    }
+
+    fn start_failed(&mut self, at: (Now, NodeIndex), attempts: u32) {
+        self.change(at.1, |node| node.start_failed = Some(attempts));
+        self.tell(at, "node_start_failed", |event| {
+            event.text = format!("{attempts} start commands had no effect");
         });
     }
 
@@ -365,6 +378,7 @@ impl Gateway {
             told_lost = std::mem::take(&mut node.told_lost);
         });
         self.make_contact(at.1);
+        self.show_errors_unasked(at.0, at.1);
         if told_lost {
             self.tell(at, "node_recovered", |_| ());
         }
@@ -424,18 +438,6 @@ impl Gateway {
             NmtRequest::ResetNode | NmtRequest::ResetCommunication => {}
         });
         self.tell(at, "nmt_command_sent", |event| request_word(request).clone_into(&mut event.to));
-    }
-
-    fn emergency(&mut self, at: (Now, NodeIndex), code: u16, register: u8, vendor: [u8; 5]) {
-        self.count(at.1, |counters| &mut counters.emcys);
-        self.tell(at, "emergency", |event| {
-            event.value = Some(Value::Unsigned(code.into()));
-            event.to = format!("0x{code:04X}");
-            let vendor = vendor.map(|byte| format!("{byte:02X}")).concat();
-            event.text = format!(
-                "error code 0x{code:04X}, error register 0x{register:02X}, manufacturer bytes {vendor}"
-            );
-        });
     }
 
     pub(super) fn change(&mut self, index: NodeIndex, change: impl FnOnce(&mut Node)) {

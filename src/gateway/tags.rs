@@ -9,7 +9,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::canopen::{PdoIndex, RpdoIndex};
-use crate::mapping::{Derived, Field, FieldKind, NodeDef, Scale, Source, TagTable, codec};
+use crate::mapping::{Derived, EmergencyPart, Field, FieldKind, NodeDef, Scale, Source, TagTable, codec};
 use crate::process_image::{NodeIndex, ProcessImage, Quality, Reason, Revision, Sample, TagIndex, Value};
 use crate::time::{Instant, Now};
 
@@ -37,20 +37,29 @@ struct Layout {
 }
 
 /// Which carrier of a node: its TPDOs, by their places in its settings; then the objects that are polled, by theirs; then
-/// the RPDOs of its definition.
+/// those of its errors; then the RPDOs of its definition.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct CarrierIndex(pub(super) usize);
 
 impl CarrierIndex {
     /// That of an RPDO.
     pub(super) fn of_rpdo(node: &NodeDef, rpdo: RpdoIndex) -> Self {
-        Self(node.canopen.pdos.len() + node.canopen.polls.len() + rpdo.0)
+        let [_, last] = Self::of_emergencies(node);
+        Self(last.0 + 1 + rpdo.0)
     }
 }
 
 impl From<PdoIndex> for CarrierIndex {
     fn from(pdo: PdoIndex) -> Self {
         Self(pdo.0)
+    }
+}
+
+impl CarrierIndex {
+    /// What emergency messages told last, as the 8 bytes of one; and how many errors there are, in one byte.
+    pub(super) fn of_emergencies(node: &NodeDef) -> [Self; 2] {
+        let first = node.canopen.pdos.len() + node.canopen.polls.len();
+        [Self(first), Self(first + 1)]
     }
 }
 
@@ -308,7 +317,8 @@ impl NodeLayout {
     fn new(table: &TagTable, node: &NodeDef, dependents: &[Vec<TagIndex>], units: &Units) -> Self {
         let mut carriers = Vec::new();
         let pdos = node.canopen.pdos.len();
-        let received = pdos + node.canopen.polls.len();
+        let [told, count] = CarrierIndex::of_emergencies(node);
+        let received = count.0 + 1;
         carriers.resize_with(received + node.rpdos.len(), CarrierLayout::default);
         let (mut derived, mut adopted) = (Vec::new(), Vec::new());
         for tag in node.tags.clone().map(TagIndex) {
@@ -323,6 +333,10 @@ impl NodeLayout {
                     None
                 }
                 Some(Source::Rpdo { rpdo, field, scale, .. }) => Some((received + rpdo, field, scale)),
+                Some(Source::Emergency { part, field, scale }) => {
+                    let carrier = if *part == EmergencyPart::ActiveCount { count } else { told };
+                    Some((carrier.0, field, scale))
+                }
                 Some(Source::Derived(_)) => {
                     derived.push(tag);
                     None
@@ -471,7 +485,8 @@ fn never_received(source: &Source) -> Sample {
         Source::Pdo { field, scale, .. }
         | Source::Polled { field, scale, .. }
         | Source::Adopted { field, scale, .. }
-        | Source::Rpdo { field, scale, .. } => {
+        | Source::Rpdo { field, scale, .. }
+        | Source::Emergency { field, scale, .. } => {
             let raw = match field.kind {
                 FieldKind::Bool => Value::Bool(false),
                 FieldKind::Unsigned => Value::Unsigned(0),

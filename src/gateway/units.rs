@@ -77,7 +77,7 @@ impl Units {
                 | Source::Polled { scale, .. }
                 | Source::Adopted { scale, .. }
                 | Source::Rpdo { scale, .. } => *scale,
-                Source::Derived(_) => return None,
+                Source::Derived(_) | Source::Emergency { .. } => return None,
             };
             let def = tag.device_unit.clone()?;
             let node = table.node(tag.node)?;

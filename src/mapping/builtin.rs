@@ -50,7 +50,11 @@ impl BuiltinAlarm {
 
 const BUS_TROUBLE: &[&str] = &["bus_off", "interface_down", "bus_silent"];
 const BUS_GONE: &[&str] = &["bus_off", "interface_down"];
-const BUS_TROUBLE_OR_LOST: &[&str] = &["bus_off", "interface_down", "bus_silent", "node_lost"];
+/// What tells the cause of most that happens to a node.
+pub(super) const BUS_TROUBLE_OR_LOST: &[&str] = &["bus_off", "interface_down", "bus_silent", "node_lost"];
+/// A device that is not the right one is given no heartbeat.
+const BUS_TROUBLE_OR_OTHER: &[&str] = &["bus_off", "interface_down", "bus_silent", "identity_mismatch"];
+const NO_START: &[&str] = &["bus_off", "interface_down", "bus_silent", "node_lost", "identity_mismatch"];
 
 /// Those of the gateway.
 pub const OF_GATEWAY: &[BuiltinAlarm] = &[BuiltinAlarm {
@@ -169,13 +173,25 @@ pub const OF_BUS: &[BuiltinAlarm] = &[
 /// Those of each node, a cause before what it suppresses. `pdo_timeout_{}` is there once for each TPDO.
 pub const OF_NODE: &[BuiltinAlarm] = &[
     BuiltinAlarm {
+        name: "identity_mismatch",
+        condition: BuiltIn::IdentityMismatch,
+        priority: Priority::High,
+        on_delay_ms: 0,
+        off_delay_ms: 0,
+        latch: false,
+        suppressed_by: BUS_TROUBLE,
+        bit: Some(10),
+        text: "Another device answers than the one that its mapping is for; it is not started.",
+        action: "Check which device has this node id, and which mapping the configuration names for it.",
+    },
+    BuiltinAlarm {
         name: "node_lost",
         condition: BuiltIn::NodeLost,
         priority: Priority::High,
         on_delay_ms: 0,
         off_delay_ms: 0,
         latch: false,
-        suppressed_by: BUS_TROUBLE,
+        suppressed_by: BUS_TROUBLE_OR_OTHER,
         bit: Some(0),
         text: "The device no longer answers; its values are not valid.",
         action: "Check its supply and its CAN cable.",
@@ -199,7 +215,7 @@ pub const OF_NODE: &[BuiltinAlarm] = &[
         on_delay_ms: 0,
         off_delay_ms: 0,
         latch: false,
-        suppressed_by: BUS_TROUBLE_OR_LOST,
+        suppressed_by: NO_START,
         bit: Some(2),
         text: "The device does not become operational although it was told to start several times.",
         action: "Look whether another master stops it; else restart the device.",
@@ -275,5 +291,17 @@ pub const OF_NODE: &[BuiltinAlarm] = &[
         bit: Some(6),
         text: "Answers to node guarding repeat their toggle bit.",
         action: "Look for a second master that guards this device.",
+    },
+    BuiltinAlarm {
+        name: "emergency",
+        condition: BuiltIn::Emergency,
+        priority: Priority::Low,
+        on_delay_ms: 0,
+        off_delay_ms: 0,
+        latch: false,
+        suppressed_by: BUS_TROUBLE_OR_LOST,
+        bit: Some(9),
+        text: "The device reports an error that its mapping does not name.",
+        action: "Look up the error code in the manual of the device.",
     },
 ];

@@ -46,8 +46,8 @@ pub use reader::{is_mapping, locate};
 pub use shipped::shipped;
 pub use table::{
     AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, BusDef, DEVICE_UNIT, Derived, DeviceDef, DeviceUnit,
-    Encoding, Field, FieldKind, NodeDef, OnLoss, PublishDef, Reading, RegisterDef, RpdoDef, Scale, Source,
-    Space, TagDef, TagTable, Told, WriteLimits,
+    EmergencyDef, EmergencyPart, Encoding, ErrorDef, Field, FieldKind, NodeDef, OnLoss, PublishDef, Reading,
+    RegisterDef, RpdoDef, Scale, Source, Space, TagDef, TagTable, Told, WriteLimits,
 };
 
 /// JSON Schema of a device mapping, for editors.

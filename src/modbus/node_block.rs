@@ -307,7 +307,11 @@ impl<'a> NodeView<'a> {
         let tags = self.table.tags.get(self.def.tags.clone()).unwrap_or_default();
         tags.iter().zip(self.def.tags.clone()).filter_map(|(tag, index)| match tag.source {
             Source::Pdo { pdo, .. } => Some((pdo, self.image.tag(TagIndex(index)).quality)),
-            Source::Derived(_) | Source::Polled { .. } | Source::Adopted { .. } | Source::Rpdo { .. } => None,
+            Source::Derived(_)
+            | Source::Polled { .. }
+            | Source::Adopted { .. }
+            | Source::Rpdo { .. }
+            | Source::Emergency { .. } => None,
         })
     }
 

@@ -1,6 +1,6 @@
 //! Where a tag's value comes from, in words for the register map.
 
-use crate::mapping::{Derived, Field, NodeDef, Source, TagTable};
+use crate::mapping::{Derived, EmergencyPart, Field, NodeDef, Source, TagTable};
 use crate::process_image::TagIndex;
 
 /// `TPDO3 byte 0 bit 1`, `maximum of knock_intensity_1 .. knock_intensity_20`.
@@ -20,6 +20,12 @@ pub fn source_text(table: &TagTable, node: &NodeDef, source: &Source) -> String 
             object.map_or_else(String::new, |object| format!("SDO {object}"))
         }
         Source::Adopted { object, .. } => format!("{object}, where the device maps it"),
+        Source::Emergency { part, .. } => match part {
+            EmergencyPart::Code => "EMCY error code".to_owned(),
+            EmergencyPart::Register => "EMCY error register".to_owned(),
+            EmergencyPart::Vendor => "EMCY manufacturer bytes".to_owned(),
+            EmergencyPart::ActiveCount => "number of errors".to_owned(),
+        },
         Source::Derived(derived) => derived_text(table, derived),
     }
 }

@@ -119,7 +119,7 @@ pub fn alarm(out: &mut String, table: &TagTable, def: &AlarmDef, status: &AlarmS
     json.integer("count", status.count);
     json.bool("first_out", status.first_out);
     json.value("value", status.value, table.decimals(def.value));
-    json.text("text", &def.text);
+    json.text("text", &def.told(status.value));
     json.text("action", &def.action);
     json.finish();
 }

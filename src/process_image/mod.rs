@@ -28,6 +28,7 @@ pub use value::Value;
 
 /// A word of the field that readers need; defined where the protocol is.
 pub use crate::canopen::NmtState;
+pub use crate::canopen::emcy::{ErrorLog, ErrorRecord};
 use crate::time::{Instant, Timestamp};
 
 /// A tag of some node, by its place in the tag table.

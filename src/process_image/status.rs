@@ -1,6 +1,6 @@
 //! What readers see of nodes, buses and alarms, beside the tags.
 
-use super::{NmtState, Revision, Value};
+use super::{ErrorLog, NmtState, Revision, Value};
 use crate::time::{Instant, Timestamp};
 
 /// What is known of one node.
@@ -24,6 +24,8 @@ pub struct NodeStatus {
     pub data_good: bool,
     /// One entry for each TPDO of the mapping, in its order.
     pub pdos: Vec<PdoStatus>,
+    /// What it told of its errors.
+    pub errors: ErrorLog,
     /// Counters since the start of the gateway.
     pub counters: NodeCounters,
     /// UTC of the newest process data.
@@ -51,9 +53,11 @@ impl NodeStatus {
             return false;
         }
         let (mut reason, mut pdos) = (std::mem::take(&mut self.reason), std::mem::take(&mut self.pdos));
+        let mut errors = std::mem::take(&mut self.errors);
         reason.clone_from(&newer.reason);
         pdos.clone_from(&newer.pdos);
-        *self = Self { reason, pdos, revision, ..*newer };
+        errors.copy_from(&newer.errors);
+        *self = Self { reason, pdos, errors, revision, ..*newer };
         true
     }
 }

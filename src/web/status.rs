@@ -8,8 +8,8 @@ use super::health::{ProgramHealth, SessionHealth};
 use crate::mapping::{AlarmDef, AlarmOwner, Derived, FieldKind, NodeDef, Objection, Source, TagTable};
 use crate::process_image::value::rounded;
 use crate::process_image::{
-    AlarmState, AlarmStatus, Event, NmtState, NodeIndex, NodeStatus, Priority, ProcessImage, Quality,
-    TagIndex, Value,
+    AlarmState, AlarmStatus, ErrorLog, ErrorRecord, Event, NmtState, NodeIndex, NodeStatus, Priority,
+    ProcessImage, Quality, TagIndex, Value,
 };
 use crate::time::{Instant, Now, Timestamp};
 
@@ -132,8 +132,49 @@ pub struct NodeView<'a> {
     quality: &'static str,
     ts: Option<i64>,
     pdos: Vec<PdoView>,
+    errors: ErrorsView<'a>,
     counters: Counters<11>,
     tags: Vec<TagView<'a>>,
+}
+
+/// What a node told of its errors.
+#[derive(Debug, Serialize)]
+struct ErrorsView<'a> {
+    /// Those that are there, the oldest first.
+    active: Vec<ErrorView<'a>>,
+    /// What was told, the newest first.
+    history: Vec<ErrorView<'a>>,
+}
+
+#[derive(Debug, Serialize)]
+struct ErrorView<'a> {
+    ts: i64,
+    code: String,
+    meaning: &'static str,
+    /// Its alarm, where the mapping names it.
+    name: Option<&'a str>,
+    register: u8,
+    /// Manufacturer bytes in hexadecimal.
+    vendor: String,
+    count: u64,
+}
+
+impl<'a> ErrorsView<'a> {
+    fn new(def: &'a NodeDef, errors: &ErrorLog) -> Self {
+        let view = |record: &ErrorRecord| ErrorView {
+            ts: record.at.as_millis(),
+            code: format!("0x{:04X}", record.emergency.code),
+            meaning: record.meaning(),
+            name: record.entry.and_then(|entry| def.emergency.errors.get(entry)).map(|def| def.name.as_str()),
+            register: record.emergency.register,
+            vendor: record.emergency.vendor.map(|byte| format!("{byte:02X}")).concat(),
+            count: record.count,
+        };
+        Self {
+            active: errors.active().iter().map(view).collect(),
+            history: errors.history().map(view).collect(),
+        }
+    }
 }
 
 #[derive(Debug, Serialize)]
@@ -178,6 +219,7 @@ impl<'a> NodeView<'a> {
             quality: quality.word(),
             ts: status.newest_data.map(Timestamp::as_millis),
             pdos: pdos(status, now),
+            errors: ErrorsView::new(def, &status.errors),
             counters: Counters(status.counters.named()),
             tags: tags(table, image, def, now),
         })
@@ -223,7 +265,8 @@ fn kind(source: &Source) -> &'static str {
         Source::Pdo { field, .. }
         | Source::Polled { field, .. }
         | Source::Adopted { field, .. }
-        | Source::Rpdo { field, .. } => field.kind == FieldKind::Bool,
+        | Source::Rpdo { field, .. }
+        | Source::Emergency { field, .. } => field.kind == FieldKind::Bool,
         Source::Derived(derived) => {
             matches!(derived, Derived::Bit { .. } | Derived::Logic { .. } | Derived::Latch { .. })
         }
@@ -280,7 +323,7 @@ pub struct AlarmView<'a> {
     count: u64,
     first_out: bool,
     value: Option<Json>,
-    text: &'a str,
+    text: Cow<'a, str>,
     action: &'a str,
 }
 
@@ -309,7 +352,7 @@ impl<'a> AlarmView<'a> {
             count: status.count,
             first_out: status.first_out,
             value: status.value.map(|value| Json(value, table.decimals(def.value))),
-            text: &def.text,
+            text: def.told(status.value),
             action: &def.action,
         }
     }

@@ -210,6 +210,14 @@ impl World {
         self.settle();
     }
 
+    /// A frame in candump notation comes to the gateway now, from nobody who is simulated.
+    pub fn overhear(&mut self, frame: &str) {
+        let event = BusEvent::Frame { frame: frame.parse().unwrap(), at: self.now() };
+        let now = self.now();
+        self.gateway.as_mut().unwrap().handle_input(now, Input::Bus { bus: BUS, event });
+        self.settle();
+    }
+
     /// Everybody but the sender sees a frame.
     fn deliver(&mut self, now: Now, sender: Sender, frame: CanFrame) {
         for (place, device) in self.devices.iter_mut().enumerate() {

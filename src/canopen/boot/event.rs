@@ -19,6 +19,13 @@ pub enum BootEvent {
         /// Its bytes, little-endian.
         data: Option<Vec<u8>>,
     },
+    /// What is wrong with the node, as it says itself.
+    Errors {
+        /// The error register; `None` where it refuses to tell it.
+        register: Option<u8>,
+        /// The code of its newest error; 0 = none, or it refuses to tell it.
+        code: u16,
+    },
     /// An object was written, because it had another value.
     Wrote {
         /// Which.

@@ -27,6 +27,7 @@ impl BootSettings {
             | BootStep::Identity { .. }
             | BootStep::Read { .. }
             | BootStep::Write { .. }
+            | BootStep::Errors
             | BootStep::Save => None,
         })
     }
@@ -41,6 +42,7 @@ impl BootSettings {
             | BootStep::Identity { .. }
             | BootStep::Read { .. }
             | BootStep::Write { .. }
+            | BootStep::Errors
             | BootStep::Save => None,
         })
     }
@@ -52,6 +54,12 @@ impl BootSettings {
             MappingMode::Adopt { timed } => Some(timed),
             MappingMode::Write | MappingMode::Verify => None,
         }
+    }
+
+    /// Whether the node is asked what is wrong with it.
+    #[must_use]
+    pub fn asks_about_errors(&self) -> bool {
+        self.steps.contains(&BootStep::Errors)
     }
 
     /// Whether the node is asked what a TPDO carries.
@@ -91,6 +99,9 @@ pub enum BootStep {
         /// A node that refuses is started all the same (K-DST-15).
         optional: bool,
     },
+    /// Reads the error register (0x1001) and the newest error (0x1003:1) and tells them. That the node refuses to tell one
+    /// of them is no failure (R-DST-081). How many errors there are (0x1003:0) is not asked: not every device keeps it.
+    Errors,
     /// Reads a TPDO's communication and mapping parameters and tells them; changes them first where it is asked to.
     Pdo(PdoSetup),
     /// The same for an RPDO; its `pdo` is the place among the RPDOs of the node's settings.

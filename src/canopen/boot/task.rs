@@ -8,6 +8,9 @@ use crate::canopen::sdo::{SdoError, SdoRequest};
 /// 0x1010:1, and what is written there: "save".
 const STORE: ObjectId = ObjectId::new(0x1010, 1);
 const SAVE: [u8; 4] = *b"save";
+/// Error register, and the newest error.
+const ERROR_REGISTER: ObjectId = ObjectId::new(0x1001, 0);
+const NEWEST_ERROR: ObjectId = ObjectId::new(0x1003, 1);
 /// Device type.
 const DEVICE_TYPE: ObjectId = ObjectId::new(0x1000, 0);
 
@@ -51,8 +54,18 @@ pub(super) enum Task {
     Identity { object: ObjectId, expected: u32 },
     Read { object: ObjectId, told: bool },
     Write(Write),
+    Errors(Errors),
     Pdo(PdoTask),
     Save { needed: bool },
+}
+
+/// Asks what is wrong with the node.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Errors {
+    Begin,
+    Register,
+    Newest { register: Option<u8> },
+    Told,
 }
 
 /// Sees to it that an object has a value.
@@ -91,6 +104,7 @@ impl Task {
                 optional: *optional,
                 phase: WritePhase::Begin,
             }),
+            BootStep::Errors => Self::Errors(Errors::Begin),
             BootStep::Pdo(setup) => Self::Pdo(PdoTask::new(setup.clone(), false)),
             BootStep::Rpdo(setup) => Self::Pdo(PdoTask::new(setup.clone(), true)),
             BootStep::Save => Self::Save { needed: written > 0 },
@@ -103,6 +117,7 @@ impl Task {
             Self::Identity { object, expected } => identity(*object, *expected, answer),
             Self::Read { object, told } => read(*object, told, answer),
             Self::Write(write) => write.advance(answer),
+            Self::Errors(errors) => errors.advance(answer),
             Self::Pdo(task) => task.advance(answer, may_run),
             Self::Save { needed } => match answer {
                 None if *needed => Advance::Ask(SdoRequest::write(STORE, SAVE.to_vec())),
@@ -146,6 +161,37 @@ fn read(object: ObjectId, told: &mut bool, answer: Answer) -> Advance {
     };
     *told = true;
     Advance::Tell(BootEvent::Object { object, data })
+}
+
+impl Errors {
+    fn advance(&mut self, answer: Answer) -> Advance {
+        let object = if matches!(self, Self::Register) { ERROR_REGISTER } else { NEWEST_ERROR };
+        let data = match answer {
+            Some(Ok(data)) => Some(data),
+            Some(Err(SdoError::Abort(_))) | None => None,
+            Some(Err(error)) => return Advance::failed(object, error),
+        };
+        match *self {
+            Self::Begin => {
+                *self = Self::Register;
+                Advance::Ask(SdoRequest::read(ERROR_REGISTER))
+            }
+            Self::Register => {
+                *self = Self::Newest { register: data.and_then(|data| data.first().copied()) };
+                Advance::Ask(SdoRequest::read(NEWEST_ERROR))
+            }
+            Self::Newest { register } => {
+                *self = Self::Told;
+                // R-DST-080: the code is in the lower half.
+                let code = match data.as_deref() {
+                    Some([low, high, ..]) => u16::from_le_bytes([*low, *high]),
+                    Some(_) | None => 0,
+                };
+                Advance::Tell(BootEvent::Errors { register, code })
+            }
+            Self::Told => Advance::Done,
+        }
+    }
 }
 
 impl Write {

@@ -64,6 +64,10 @@ pub(super) struct Node {
     /// Undefined state code that was told last.
     pub(super) invalid: Option<u8>,
     pub(super) unsolicited_told: bool,
+    /// It told of an error since it booted.
+    pub(super) told_errors: bool,
+    /// An emergency message was the last that it told: it may have been switched off and on without a boot-up message.
+    pub(super) unconfirmed_errors: bool,
     /// It told its state since it was lost or the bus could not be used.
     pub(super) supervised: bool,
     /// Somebody else's last guard request was not answered yet.
@@ -118,6 +122,8 @@ impl Node {
             reset_until: None,
             invalid: None,
             unsolicited_told: false,
+            told_errors: false,
+            unconfirmed_errors: false,
             supervised: false,
             overheard_request: false,
             foreign_guard_until: None,
@@ -289,7 +295,7 @@ impl Node {
                 let due = guarding.handle_timeout(now);
                 let dlc = guarding.rtr_dlc();
                 if let Some(failure) = due.missed {
-                    self.missed(failure, outputs);
+                    self.missed(now, failure, outputs);
                 }
                 let request = CanFrame::remote_frame(cob_id::error_control(self.id), dlc);
                 if let Some(request) = request.filter(|_| due.request) {
@@ -298,7 +304,7 @@ impl Node {
             }
             Watch::Heartbeat(heartbeat) => {
                 if heartbeat.handle_timeout(now) {
-                    self.lost(false, outputs);
+                    self.lost(now, false, outputs);
                 }
             }
             Watch::Nothing => {}
@@ -362,21 +368,32 @@ impl Node {
     }
 
     /// A guard request was not answered.
-    pub(super) fn missed(&mut self, failure: Failure, outputs: &mut Outputs) {
+    pub(super) fn missed(&mut self, now: Instant, failure: Failure, outputs: &mut Outputs) {
         outputs.node(self.id, NodeEvent::GuardMissed { consecutive: failure.consecutive });
         if let Some(stuck_toggle) = failure.lost {
-            self.lost(stuck_toggle, outputs);
+            self.lost(now, stuck_toggle, outputs);
         }
     }
 
     /// The node is lost (R-DET-036).
-    pub(super) fn lost(&mut self, stuck_toggle: bool, outputs: &mut Outputs) {
+    pub(super) fn lost(&mut self, now: Instant, stuck_toggle: bool, outputs: &mut Outputs) {
         self.supervised = false;
         outputs.node(self.id, NodeEvent::Lost { stuck_toggle });
         self.polls.stop();
         self.pdos.stop();
         if let Some(start) = &mut self.start {
             start.cancel();
+        }
+        if std::mem::take(&mut self.unconfirmed_errors) {
+            self.boot_again(now, outputs);
+        }
+    }
+
+    /// A lost node shows that it is there, though not that it goes on as before: it is booted, unless that is under way.
+    pub(super) fn boot_again(&mut self, now: Instant, outputs: &mut Outputs) {
+        if self.boot.is_done() {
+            self.boot.handle_recovered(now);
+            self.transfer(now, outputs);
         }
     }
 

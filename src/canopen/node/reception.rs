@@ -5,6 +5,7 @@
 use std::time::Duration;
 
 use super::super::duplicate::StateKind;
+use super::super::emcy::Emergency;
 use super::super::guarding::Verdict;
 use super::super::outputs::Outputs;
 use super::super::pdo::Length;
@@ -98,6 +99,10 @@ impl Node {
             }
             self.transfer(now, outputs);
         }
+        self.unconfirmed_errors = false;
+        if std::mem::take(&mut self.told_errors) {
+            outputs.node(self.id, NodeEvent::ErrorsForgotten);
+        }
         self.invalid = None;
         self.set_state(NmtState::Initialising, true, outputs);
         self.ordered = None;
@@ -121,7 +126,7 @@ impl Node {
                 let missed = guarding.expire(now);
                 let verdict = guarding.handle_reply(now, toggle);
                 if let Some(failure) = missed {
-                    self.missed(failure, outputs);
+                    self.missed(now, failure, outputs);
                 }
                 self.compare(now, kind_of(verdict, toggle), outputs);
                 match self.weigh(now, verdict, byte, outputs) {
@@ -132,6 +137,7 @@ impl Node {
             Watch::Heartbeat(heartbeat) => heartbeat.alive(now),
             Watch::Nothing => false,
         };
+        self.unconfirmed_errors = false;
         if recovered {
             outputs.node(self.id, NodeEvent::Recovered);
             // It may be another device, or one that lost its settings: everything is read again.
@@ -163,7 +169,7 @@ impl Node {
                 self.duplicate.handle_reply(byte);
                 outputs.node(self.id, NodeEvent::ToggleError { consecutive: failure.consecutive });
                 if let Some(stuck_toggle) = failure.lost {
-                    self.lost(stuck_toggle, outputs);
+                    self.lost(now, stuck_toggle, outputs);
                 }
                 None
             }
@@ -320,7 +326,7 @@ impl Node {
         }
     }
 
-    /// A frame on `0x080 + id` (R-DET-091). Devices from before version 4 of CiA 301 boot up with an empty one.
+    /// An emergency message (R-DET-091, R-DST-074). Devices from before version 4 of CiA 301 boot up with an empty one.
     pub(in crate::canopen) fn handle_emergency(
         &mut self,
         now: Instant,
@@ -332,21 +338,25 @@ impl Node {
             return false;
         }
         self.frame_seen(now, outputs);
-        match *frame.data() {
-            [] => return self.boot_up(now, false, outputs),
-            [low, high, register, ref rest @ ..] => {
-                let mut vendor = [0; 5];
-                for (to, from) in vendor.iter_mut().zip(rest) {
-                    *to = *from;
-                }
-                let code = u16::from_le_bytes([low, high]);
-                outputs.node(self.id, NodeEvent::Emergency { code, register, vendor });
-                if code == COLLISION {
-                    let evidence = self.duplicate.handle_collision(now);
-                    self.suspect(evidence, outputs);
-                }
-            }
-            _ => outputs.node(self.id, NodeEvent::Malformed { frame: *frame }),
+        if frame.data().is_empty() {
+            return self.boot_up(now, false, outputs);
+        }
+        let Some(Emergency { code, register, vendor }) = Emergency::decode(frame.data()) else {
+            outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
+            return false;
+        };
+        self.told_errors |= code != 0;
+        outputs.node(self.id, NodeEvent::Emergency { code, register, vendor });
+        if code == COLLISION {
+            let evidence = self.duplicate.handle_collision(now);
+            self.suspect(evidence, outputs);
+        }
+        // A device that finds an error when it is switched on may send this in place of its boot-up message (R-DST-052).
+        // Such a one that was not missed yet is found out when it is.
+        if self.watch.is_lost() {
+            self.boot_again(now, outputs);
+        } else {
+            self.unconfirmed_errors = code != 0;
         }
         false
     }

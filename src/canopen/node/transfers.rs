@@ -138,6 +138,7 @@ impl Node {
                 if let BootEvent::RpdoMapped(mapped) = &event {
                     self.rpdo_mapped(now, RpdoIndex(mapped.pdo.0), mapped.cob_id, &mapped.maps);
                 }
+                self.told_errors |= matches!(event, BootEvent::Errors { code, .. } if code != 0);
                 let done = matches!(event, BootEvent::Done { .. });
                 outputs.node(self.id, NodeEvent::Boot(event));
                 if done {

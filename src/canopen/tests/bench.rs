@@ -129,6 +129,7 @@ pub(super) fn detcon(id: u8) -> NodeSettings {
         polls: Vec::new(),
         pdos: [(1, 8), (2, 8), (3, 8), (4, 6)].into_iter().map(pdo).collect(),
         rpdos: Vec::new(),
+        emergency: None,
         never_seen_after: Duration::from_secs(10),
     }
 }

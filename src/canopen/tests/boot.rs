@@ -327,6 +327,53 @@ fn r_dst_053_a_silent_node_is_asked_ever_more_seldom_and_at_once_when_it_shows_i
 }
 
 #[test]
+fn r_dst_080_081_a_node_is_asked_what_is_wrong_with_it_and_a_refusal_is_no_error() {
+    let told = |register: Option<u8>, newest: Option<u32>| {
+        let mut plant = Plant::new(vec![BootStep::Errors]);
+        // K-DST-09: a count of 1 says nothing.
+        plant.device.objects.insert(object(0x1003, 0), vec![1]);
+        plant.device.objects.extend(register.map(|register| (object(0x1001, 0), vec![register])));
+        plant.device.objects.extend(newest.map(|newest| (object(0x1003, 1), newest.to_le_bytes().to_vec())));
+        plant.link_up();
+        assert_eq!(plant.told.last(), Some(&BootEvent::Done { written: 0 }));
+        plant.told.remove(0)
+    };
+    assert_eq!(told(Some(0x21), Some(0x0021_F011)), BootEvent::Errors { register: Some(0x21), code: 0xF011 });
+    assert_eq!(told(Some(0), Some(0)), BootEvent::Errors { register: Some(0), code: 0 });
+    assert_eq!(told(Some(1), None), BootEvent::Errors { register: Some(1), code: 0 });
+    assert_eq!(told(None, None), BootEvent::Errors { register: None, code: 0 });
+}
+
+#[test]
+fn r_dst_052_a_lost_node_that_sends_an_emergency_message_instead_of_a_boot_up_is_booted() {
+    let mut plant = Plant::new(steps());
+    plant.link_up().run(3000);
+    plant.device.mute = true;
+    plant.run(3000);
+    plant.told.clear();
+    plant.device = Device::new();
+    for _ in 0..3 {
+        plant.frame("081#0063810000000000");
+    }
+    assert_eq!(plant.begun, 2, "once, however many there are");
+    plant.run(3000);
+    assert!(plant.told.iter().any(|event| matches!(event, BootEvent::Done { .. })), "{:?}", plant.told);
+    assert_eq!(plant.device.state, NmtState::Operational);
+}
+
+#[test]
+fn r_dst_052_so_is_one_that_sent_it_before_it_was_missed() {
+    let mut plant = Plant::new(steps());
+    plant.link_up().run(3000);
+    plant.told.clear();
+    plant.device = Device::new();
+    plant.frame("081#0063810000000000");
+    plant.run(10_000);
+    assert!(plant.told.iter().any(|event| matches!(event, BootEvent::Done { .. })), "{:?}", plant.told);
+    assert_eq!(plant.device.state, NmtState::Operational);
+}
+
+#[test]
 fn r_dst_064_a_boot_up_message_begins_everything_anew() {
     let mut plant = Plant::new(steps());
     plant.link_up();

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::bench::{Bench, detcon, master, mute, passive, running, running_with, usable};
+use crate::can::{CanFrame, CanId};
 use crate::canopen::{
     ErrorControl, GuardingSettings, NetworkOutput, NetworkSettings, NmtRequest, NodeId, NodeSettings,
     StartSettings,
@@ -390,6 +391,27 @@ fn r_det_091_emergency_messages() {
             "4 Malformed { frame: 081#3081 }",
         ]
     );
+}
+
+#[test]
+fn emergency_messages_may_have_any_identifier() {
+    for id in [CanId::Standard(0x0F1), CanId::Extended(0x001A_BCDE)] {
+        let mut bench = running_with(NodeSettings { emergency: Some(id), ..mute() });
+        let frame = CanFrame::data_frame(id, &[0, 0x50, 1]).unwrap();
+        bench.frame(1, &frame.to_string()).frame(2, "081#005001");
+        let lines = bench.take();
+        assert_eq!(lines[0], "1 Emergency { code: 20480, register: 1, vendor: [0, 0, 0, 0, 0] }");
+        assert!(lines[1].contains("UnknownId"), "{lines:?}");
+    }
+}
+
+#[test]
+fn a_boot_up_ends_errors_only_where_one_was_told() {
+    let mut bench = running();
+    bench.frame(1, "701#00").frame(2, "081#0000000000000000").frame(3, "701#00");
+    assert_eq!(bench.take_those_with("ErrorsForgotten"), Vec::<String>::new());
+    bench.frame(4, "081#0050010000000000").frame(5, "701#00").frame(6, "701#00");
+    assert_eq!(bench.take_those_with("ErrorsForgotten"), ["5 ErrorsForgotten"]);
 }
 
 #[test]

@@ -5,10 +5,11 @@ use std::ops::Range;
 use std::time::Duration;
 
 use super::super::builtin::{BuiltinAlarm, OF_BUS, OF_GATEWAY, OF_NODE};
-use super::super::file::AlarmSection;
+use super::super::file::{AlarmSection, IdentitySection};
 use super::super::table::{AlarmCondition, AlarmDef, AlarmOwner, BuiltIn};
 use super::super::{At, SourceText};
 use super::derived::condition;
+use super::emergency;
 use super::items::{Element, elements, refuse_stride};
 use super::order::causes_first;
 use super::problems::{Problems, is_snake_case, matched};
@@ -62,10 +63,13 @@ fn plain(builtin: &BuiltinAlarm, owner: AlarmOwner) -> AlarmDef {
 }
 
 /// An alarm whose causes are still names.
-struct Draft {
-    alarm: AlarmDef,
-    causes: Vec<(String, Option<Range<usize>>)>,
-    span: Range<usize>,
+pub struct Draft {
+    /// It, without its causes.
+    pub alarm: AlarmDef,
+    /// They, and where the mapping names them.
+    pub causes: Vec<(String, Option<Range<usize>>)>,
+    /// Where the name of the alarm stands.
+    pub span: Range<usize>,
 }
 
 /// The alarms of a node: built-in ones first, then those of the mapping, causes before what they suppress. `base` is the place
@@ -80,7 +84,9 @@ pub fn of_node(
 ) -> Vec<AlarmDef> {
     let mut known: BTreeSet<String> = OF_BUS.iter().map(|builtin| builtin.name.to_owned()).collect();
     let mut drafts = built_in(problems, context, pdos, &mut known);
-    drafts.extend(from_mapping(problems, context, places, &mut known));
+    let mut names = BTreeMap::new();
+    drafts.extend(from_mapping(problems, context, places, &mut known, &mut names));
+    drafts.extend(emergency::alarms(problems, context, &mut known, &mut names));
     check_names(problems, context, &known);
     let by_name: BTreeMap<String, usize> =
         drafts.iter().enumerate().map(|(index, draft)| (draft.alarm.name.clone(), index)).collect();
@@ -135,7 +141,10 @@ fn built_in(
 ) -> Vec<Draft> {
     let mut drafts = Vec::new();
     for builtin in OF_NODE {
-        let one = [(builtin.name.to_owned(), builtin.text.to_owned(), builtin.condition, true)];
+        // Who is not asked who it is cannot be another.
+        let asked = BuiltIn::IdentityMismatch != builtin.condition
+            || context.file.identity.as_ref().is_some_and(|identity| *identity != IdentitySection::default());
+        let one = [(builtin.name.to_owned(), builtin.text.to_owned(), builtin.condition, asked)];
         let each = pdos.iter().enumerate().map(|(place, pdo)| {
             let fill = |text: &str| text.replace("{}", &pdo.number.to_string());
             (fill(builtin.name), fill(builtin.text), BuiltIn::PdoTimeout(place), pdo.timeout.is_some())
@@ -177,7 +186,8 @@ fn built_in(
     drafts
 }
 
-fn delay(
+/// A delay of an alarm.
+pub fn delay(
     problems: &mut Problems,
     source: &SourceText,
     at: Option<&At<u64>>,
@@ -188,7 +198,7 @@ fn delay(
 }
 
 /// What `[node.NAME.alarm.ALARM]` says. Returns whether the alarm is enabled.
-fn change_by_installation(
+pub fn change_by_installation(
     problems: &mut Problems,
     context: &Context<'_>,
     alarm: &mut AlarmDef,
@@ -214,16 +224,16 @@ fn from_mapping(
     context: &Context<'_>,
     places: &[usize],
     known: &mut BTreeSet<String>,
+    names: &mut BTreeMap<String, usize>,
 ) -> Vec<Draft> {
     let mut drafts = Vec::new();
     let mut bits: BTreeMap<u64, &At<String>> = BTreeMap::new();
-    let mut names: BTreeMap<String, usize> = BTreeMap::new();
     for section in &context.file.alarm {
         check_bit(problems, context, section, &mut bits);
         refuse_stride(problems, context.source, section.array.as_ref());
         for element in elements(problems, context.source, &section.name, section.array.as_ref()) {
             let name = element.fill(&section.name.value);
-            check_name(problems, context, section, &name, known, &mut names);
+            check_name(problems, context, &section.name.span, &name, known, names);
             known.insert(name.clone());
             let (draft, enabled) = draft(problems, context, places, section, &element, name);
             if enabled {
@@ -254,15 +264,15 @@ fn check_bit<'a>(
     }
 }
 
-fn check_name(
+/// An alarm of the mapping has a name of its own. `names`: those before, and where they stand.
+pub fn check_name(
     problems: &mut Problems,
     context: &Context<'_>,
-    section: &AlarmSection,
+    span: &Range<usize>,
     name: &str,
     known: &BTreeSet<String>,
     names: &mut BTreeMap<String, usize>,
 ) {
-    let span = &section.name.span;
     if !is_snake_case(name) {
         let hint = "use 1 to 64 of a-z, 0-9 and _, a letter first";
         problems.error(context.source, span, format!("`{name}` cannot be the name of an alarm"), hint);

@@ -23,10 +23,13 @@ const EMERGENCY_ID: ObjectId = ObjectId::new(0x1014, 0);
 /// A unit that somebody changes in a running device is noticed within this time.
 const UNIT_PERIOD: Duration = Duration::from_secs(10);
 
-/// The steps of the boot: identity, heartbeat, settings, units, and the PDOs last, so that what they carry is read when all
-/// else is as it should be.
+/// The steps of the boot: identity, errors, heartbeat, settings, units, and the PDOs last, so that what they carry is
+/// read when all else is as it should be.
 pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
     let mut steps = identity(problems, context);
+    if context.file.emergency.read_at_boot {
+        steps.push(BootStep::Errors);
+    }
     if let Some(at) = &context.file.error_control.heartbeat_ms {
         let millis = problems.within(context.source, at, "heartbeat_ms", 10..=65_535);
         let data = u16::try_from(millis).unwrap_or(u16::MAX).to_le_bytes().to_vec();

@@ -159,7 +159,8 @@ fn place(
             found.map(|(number, bit)| (at(number), at(bit)))
         }
         _ => {
-            let message = format!("`{}` needs either `tpdo` and `bit`, or `object`", item.name);
+            let message =
+                format!("`{}` needs either `tpdo` and `bit`, or `object`, or `emergency`", item.name);
             problems.error(source, &item.span, message, "write where it stands, or which object it is");
             None
         }

@@ -3,7 +3,7 @@
 //! - this file: what an installation is, and the way through its buses and nodes.
 //! - `items`: the tags of a mapping, arrays unrolled. `tags`, `fields`, `derived`: what they become; `units`: those of the device.
 //! - `node`: what the CANopen master needs to know; `boot`: what it does before it starts the node.
-//! - `alarms`: alarms, their order and what suppresses them.
+//! - `alarms`: alarms, their order and what suppresses them. `emergency`: errors that emergency messages tell of.
 //! - `broadcasts`: SYNC and TIME of a bus; `sync`: PDOs that go with SYNC; `rpdo`: what nodes are sent.
 //! - `addresses`, `network`: what must not happen twice among nodes.
 //! - `order`: causes before consequences. `problems`: where messages are collected.
@@ -14,6 +14,7 @@ mod alarms;
 mod boot;
 mod broadcasts;
 mod derived;
+mod emergency;
 mod fields;
 mod items;
 mod network;
@@ -271,6 +272,7 @@ impl Builder<'_> {
         self.claims.push(addresses::of_node(problems, context, name, unit_id, &tags, &places));
         sync::check_changes(problems, context);
         let canopen = node::settings(problems, context, id);
+        let emergency = emergency::definition(problems, context, &canopen.polls);
         self.taken.identifiers(problems, self.installation, name, bus, &canopen);
         let base = self.table.alarms.len();
         let alarms = alarms::of_node(problems, context, &canopen.pdos, &places, bus, base);
@@ -295,6 +297,7 @@ impl Builder<'_> {
             rpdos: context.rpdos.iter().map(Rpdo::def).collect(),
             outputs: entry.outputs,
             reserved_bits: context.tpdos.iter().map(Tpdo::reserved_bits).collect(),
+            emergency,
             publish: publish(problems, context, &places),
         });
         self.table.tags.extend(tags);

@@ -102,7 +102,6 @@ impl Taken {
         }
         let (config, node, id) = (installation.config, &name.value, settings.id);
         for (what, id) in [
-            ("emergency", cob_id::emcy(id)),
             ("SDO answers", cob_id::sdo_answer(id)),
             ("SDO requests", request_id(id)),
             ("heartbeat and guarding", cob_id::error_control(id)),
@@ -110,9 +109,10 @@ impl Taken {
             let owner = format!("{what} of node `{node}`");
             self.claim(problems, config, bus, id, owner, &name.span);
         }
+        let emergency = settings.emergency.unwrap_or_else(|| cob_id::emcy(settings.id));
         let tpdos = settings.pdos.iter().map(|pdo| (format!("TPDO {}", pdo.number), pdo.cob_id));
         let rpdos = settings.rpdos.iter().map(|pdo| (format!("RPDO {}", pdo.number), pdo.cob_id));
-        for (what, id) in tpdos.chain(rpdos) {
+        for (what, id) in std::iter::once(("emergency".to_owned(), emergency)).chain(tpdos).chain(rpdos) {
             let owner = format!("{what} of node `{node}`");
             let Some(purpose) = restricted(id) else {
                 self.claim(problems, config, bus, id, owner, &name.span);

@@ -8,6 +8,7 @@ use super::super::SourceText;
 use super::super::file::{MappingFile, MappingWord, TagSection, TpdoSection};
 use super::super::installation::{ErrorControlWord, NodeEntry, TpdoEntry};
 use super::boot;
+use super::emergency;
 use super::problems::Problems;
 use super::tags::Context;
 use super::{rpdo, sync};
@@ -27,7 +28,8 @@ const SHORTEST_TIMEOUT: Duration = Duration::from_millis(10);
 pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> NodeSettings {
     let error_control = error_control(problems, context);
     let steps = boot::steps(problems, context);
-    let polls = boot::polls(problems, context);
+    let mut polls = boot::polls(problems, context);
+    polls.extend(emergency::poll(problems, context));
     let pdos = context.tpdos.iter().map(|tpdo| {
         let pdo = pdo(problems, context, id, tpdo);
         // Whether one that is adopted has an event timer is seen when the device is asked.
@@ -45,6 +47,7 @@ pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> N
         boot: BootSettings { steps, ..BootSettings::default() },
         polls,
         rpdos: rpdo::settings(problems, context, id),
+        emergency: context.file.emergency.cob_id.as_ref().map(|at| at.value.of(id)),
         never_seen_after: NEVER_SEEN_AFTER,
     }
 }

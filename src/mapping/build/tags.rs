@@ -17,7 +17,7 @@ use super::node::Tpdo;
 use super::order::causes_first;
 use super::problems::{Problems, matched};
 use super::rpdo::Rpdo;
-use super::{derived, fields, node, rpdo, units};
+use super::{derived, emergency, fields, node, rpdo, units};
 use crate::process_image::{NodeIndex, TagIndex};
 
 /// Lowest register address of device data; below are those of the node itself.
@@ -188,6 +188,14 @@ fn parameter(
 }
 
 fn from_pdo(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, section: &TagSection) -> TagDef {
+    if let Some((part, field)) = emergency::source(problems, context, item, section) {
+        refuse_bits(problems, context, item, ("comes from emergency messages", "change it in the mapping"));
+        rpdo::refuse_limits(problems, context, section);
+        let scale = scale(problems, context, section.scale.as_ref());
+        let usual_decimals = if scale == Scale::IDENTITY { 0 } else { 2 };
+        let source = Source::Emergency { part, field, scale };
+        return finished(problems, context, item, section.shared(), usual_decimals, source);
+    }
     let scale = scale(problems, context, section.scale.as_ref());
     let mut source = match &section.rpdo {
         Some(rpdo) => rpdo::source(problems, context, item, section, rpdo, scale),
@@ -255,16 +263,21 @@ fn computed(
     item: &Item<'_>,
     section: &DerivedSection,
 ) -> TagDef {
-    for (name, entry) in overrides(context, &item.name) {
-        for span in entry.invert.iter().map(|at| &at.span).chain(entry.byte_order.iter().map(|at| &at.span)) {
-            let message = format!("`{}` is computed, it has no bits to change", name.value);
-            problems.error(context.config, span, message, "change the tags that it is computed from");
-        }
-    }
+    refuse_bits(problems, context, item, ("is computed", "change the tags that it is computed from"));
     let derived = derived::derived(problems, context, item, section);
     let fraction = section.maximum.is_some() || section.margin.is_some();
     let usual_decimals = if fraction { 2 } else { 0 };
     finished(problems, context, item, section.shared(), usual_decimals, Source::Derived(derived))
+}
+
+/// The installation can change the bits of tags that stand in TPDOs, and of no other.
+fn refuse_bits(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, (why, hint): (&str, &str)) {
+    for (name, entry) in overrides(context, &item.name) {
+        for span in entry.invert.iter().map(|at| &at.span).chain(entry.byte_order.iter().map(|at| &at.span)) {
+            let message = format!("`{}` {why}, it has no bits to change", name.value);
+            problems.error(context.config, span, message, hint);
+        }
+    }
 }
 
 /// A tag with all that entries share, whatever its source is.

@@ -3,10 +3,11 @@
 //! Numbers are read wide and names as text; [`build`](super::build()) checks them, so that all problems are told at once.
 //!
 //! - `canopen`: what the gateway does as master of the device. `tags`: entries that make tags. `alarms`: entries about
-//!   alarms. [`values`]: values that can be written in more than one way.
+//!   alarms. `emergency`: what emergency messages mean. [`values`]: values that can be written in more than one way.
 
 mod alarms;
 mod canopen;
+mod emergency;
 mod tags;
 pub mod values;
 
@@ -22,6 +23,7 @@ pub use canopen::{
     ErrorControlSection, IdentitySection, MappingWord, OnStartWord, RpdoSection, SetupSection, SetupValue,
     StartSection, TpdoSection,
 };
+pub use emergency::{EmergencySection, EmergencyWord, ErrorSection};
 pub use tags::*;
 
 /// A device mapping.
@@ -50,6 +52,9 @@ pub struct MappingFile {
     /// The RPDOs that it is sent, by their number: `[rpdo.1]`.
     #[serde(default)]
     pub rpdo: BTreeMap<At<String>, RpdoSection>,
+    /// Its emergency messages.
+    #[serde(default)]
+    pub emergency: EmergencySection,
     /// Objects that are written before it is started, where it has them otherwise.
     #[serde(default)]
     pub setup: Vec<SetupSection>,

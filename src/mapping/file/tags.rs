@@ -5,6 +5,7 @@ use serde::Deserialize;
 
 use super::super::At;
 use super::super::installation::ByteOrderWord;
+use super::emergency::EmergencyWord;
 use super::values::NameList;
 
 /// An entry that makes tags: keys of its own among those that all such entries share.
@@ -112,6 +113,8 @@ tag_entry! {
         pub object: Option<At<String>>,
         /// How often an object that no TPDO maps is read by SDO, 100..=86400000.
         pub poll_ms: Option<At<u64>>,
+        /// What of the emergency messages it shows, instead of `tpdo` and `bit` or `object`.
+        pub emergency: Option<At<EmergencyWord>>,
         /// `bool`, `u1`..`u64`, `i2`..`i64`, `f32` or `f64`.
         #[serde(rename = "type")]
         #[schemars(regex(pattern = r"^(bool|f32|f64|[ui]([1-9]|[1-5][0-9]|6[0-4]))$"))]

@@ -1,10 +1,12 @@
 //! Alarms.
 
+use std::borrow::Cow;
 use std::time::Duration;
 
 use super::super::expression::Expression;
 use crate::can::BusIndex;
-use crate::process_image::{NodeIndex, Priority, TagIndex};
+use crate::canopen::emcy;
+use crate::process_image::{NodeIndex, Priority, TagIndex, Value};
 
 /// An alarm.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,6 +37,22 @@ pub struct AlarmDef {
     pub text: String,
     /// What the operator should do.
     pub action: String,
+}
+
+impl AlarmDef {
+    /// What it means, in the words for the operator: with the error code, where one raised it.
+    #[must_use]
+    pub fn told(&self, value: Option<Value>) -> Cow<'_, str> {
+        let of_error =
+            matches!(self.condition, AlarmCondition::BuiltIn(BuiltIn::Emergency | BuiltIn::NamedError(_)));
+        match value {
+            Some(Value::Unsigned(code)) if of_error => {
+                let meaning = u16::try_from(code).map_or("", emcy::meaning);
+                Cow::Owned(format!("{} Error code 0x{code:04X} ({meaning}).", self.text))
+            }
+            _ => Cow::Borrowed(&self.text),
+        }
+    }
 }
 
 /// Whose an alarm is.
@@ -94,6 +112,12 @@ pub enum BuiltIn {
     PdoLength,
     /// N07: two nodes seem to share this id.
     DuplicateNode,
+    /// Another device than the mapping is for (R-DST-001).
+    IdentityMismatch,
+    /// N09: an error that the mapping does not name.
+    Emergency,
+    /// N09: an error that the mapping names, by its place in [`EmergencyDef::errors`](super::EmergencyDef::errors).
+    NamedError(usize),
     /// R-DET-043: somebody else guards this node.
     ForeignGuardMaster,
 }

@@ -4,11 +4,12 @@
 //! all built from it, so that they cannot disagree.
 //!
 //! - `tag`: tags and their places in the register map. `device_unit`: units that the device tells.
-//! - `derived`: computed tags. `alarm`: alarms.
+//! - `derived`: computed tags. `alarm`: alarms. `emergency`: errors that emergency messages tell of.
 
 mod alarm;
 mod derived;
 mod device_unit;
+mod emergency;
 mod tag;
 
 use std::collections::BTreeMap;
@@ -22,6 +23,7 @@ use crate::process_image::{NodeIndex, TagIndex};
 pub use alarm::*;
 pub use derived::*;
 pub use device_unit::*;
+pub use emergency::*;
 pub use tag::*;
 
 /// Everything that an installation has.
@@ -119,6 +121,8 @@ pub struct NodeDef {
     pub outputs: bool,
     /// Reserved bits of each PDO, by [`PdoIndex`](crate::canopen::PdoIndex): a set one is counted (R-DET-052).
     pub reserved_bits: Vec<u64>,
+    /// Its errors.
+    pub emergency: EmergencyDef,
     /// How often the MQTT state topic is published.
     pub publish: PublishDef,
 }

@@ -68,6 +68,15 @@ pub enum Source {
         /// From raw to engineering units.
         scale: Scale,
     },
+    /// What the emergency messages of the node told.
+    Emergency {
+        /// Which part of it.
+        part: EmergencyPart,
+        /// How its bytes are read.
+        field: Field,
+        /// From raw to engineering units.
+        scale: Scale,
+    },
     /// Bits of an RPDO: what the gateway sends the node.
     Rpdo {
         /// Which, by its place in [`NodeDef::rpdos`](super::NodeDef::rpdos).
@@ -97,6 +106,41 @@ pub struct WriteLimits {
 impl WriteLimits {
     /// Whatever the type can hold, and no default.
     pub const NONE: Self = Self { default: None, minimum: f64::NEG_INFINITY, maximum: f64::INFINITY };
+}
+
+/// A part of what emergency messages tell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum EmergencyPart {
+    /// Error code of the last; 0 = none.
+    Code,
+    /// Error register, of the last or as it was read.
+    Register,
+    /// Manufacturer bytes of the last.
+    Vendor,
+    /// How many errors are there.
+    ActiveCount,
+}
+
+impl EmergencyPart {
+    /// Bits that it has.
+    #[must_use]
+    pub fn width(self) -> u8 {
+        match self {
+            Self::Code => 16,
+            Self::Register | Self::ActiveCount => 8,
+            Self::Vendor => 40,
+        }
+    }
+
+    /// Where it begins: in the bytes of the message, but for the number of errors.
+    #[must_use]
+    pub fn first_bit(self) -> u8 {
+        match self {
+            Self::Code | Self::ActiveCount => 0,
+            Self::Register => 16,
+            Self::Vendor => 24,
+        }
+    }
 }
 
 /// Bits of a frame.
