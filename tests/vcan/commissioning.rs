@@ -11,7 +11,7 @@ use crate::harness::process::Process;
 use crate::harness::wait::wait_until;
 
 /// A tool that runs to its end: exit code, standard output, standard error.
-fn cangate(arguments: &[&str]) -> (i32, String, String) {
+pub fn cangate(arguments: &[&str]) -> (i32, String, String) {
     let output = Command::new(env!("CARGO_BIN_EXE_cangate"))
         .current_dir(env!("CARGO_MANIFEST_DIR"))
         .args(arguments)

@@ -14,6 +14,7 @@
 //! | `socket` | the bus room alone: link states, lost frames, full queues, receive times |
 //! | `many` | two devices, two clients, a second master |
 //! | `commissioning` | scan, init, nmt, sdo: what they send, and that a scan sends nothing |
+//! | `transmitter` | a DST P92C from its box to its values: clash, LSS, configuration, EMCY, loss, no needless write |
 //! | `namespace` | a gateway that reaches the bus from a network namespace of its own, as in a container |
 //!
 //! vcan0 is there once, so the tests run one after another; each begins with a new interface.
@@ -51,3 +52,4 @@ mod pulse;
 mod silence;
 mod socket;
 mod start;
+mod transmitter;

@@ -24,6 +24,7 @@ pub struct Setup {
     nodes: Vec<(String, u8)>,
     node_keys: String,
     mqtt_keys: String,
+    mappings: Vec<(String, String)>,
     more: String,
 }
 
@@ -42,6 +43,7 @@ impl Setup {
             nodes,
             node_keys: String::new(),
             mqtt_keys: String::new(),
+            mappings: Vec::new(),
             more: String::new(),
         }
     }
@@ -75,6 +77,17 @@ impl Setup {
         self
     }
 
+    /// A mapping file of its own.
+    pub fn mapping(mut self, name: &str, text: &str) -> Self {
+        self.mappings.push((name.to_owned(), text.to_owned()));
+        self
+    }
+
+    /// One more node.
+    pub fn node(self, name: &str, id: u8, mapping: &str) -> Self {
+        self.more(&format!("[node.{name}]\nbus = \"can0\"\nid = {id}\nmapping = \"{mapping}\""))
+    }
+
     /// Text at the end of the file.
     pub fn more(mut self, text: &str) -> Self {
         writeln!(self.more, "{text}").unwrap();
@@ -104,6 +117,10 @@ impl Setup {
         let folder = TempDir::new().unwrap();
         let (modbus, http) = (free_port(), free_port());
         std::fs::write(folder.path().join("cangate.toml"), self.text(modbus, http)).unwrap();
+        std::fs::create_dir(folder.path().join("mappings")).unwrap();
+        for (name, text) in &self.mappings {
+            std::fs::write(folder.path().join("mappings").join(format!("{name}.toml")), text).unwrap();
+        }
         let process = Gateway::spawn(&folder);
         let mut gateway = Gateway { modbus, http, process, folder };
         gateway.wait_until_it_serves();
@@ -169,11 +186,16 @@ impl Gateway {
 
 /// `cangate sim detcon` on vcan0.
 pub fn simulator(node: u8, arguments: &[&str]) -> Process {
+    simulate("detcon", node, arguments)
+}
+
+/// `cangate sim` of any device on vcan0.
+pub fn simulate(device: &str, node: u8, arguments: &[&str]) -> Process {
     Process::start(
         "cangate sim",
         Command::new(env!("CARGO_BIN_EXE_cangate"))
             .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .args(["sim", "detcon", "-i", BUS, "--node", &node.to_string()])
+            .args(["sim", device, "-i", BUS, "--node", &node.to_string()])
             .args(arguments),
     )
 }
