@@ -7,6 +7,7 @@
 //! | `devices` | the gateway core against our simulators, with loss, delay and duplicates |
 //! | `neighbours` | the gateway beside a second device of the same node id, and beside healthy ones |
 //! | `emergencies` | errors that devices tell of: alarms, tags, what is read at the start, storms |
+//! | `disturbance` | SDO under loss, duplication and delay costs the other nodes nothing; prints the worst delays |
 //! | `eds` | EDS and DCF files of any quality become mappings; an import moves nothing that it gave away |
 //! | `clashes` | identifiers that two participants of a bus would send |
 //! | `mappings` | every shipped mapping checks; every message about a wrong one says what, where and how to mend it |
@@ -51,6 +52,7 @@ mod contract;
 mod contract_mqtt;
 mod conversations;
 mod devices;
+mod disturbance;
 mod documents;
 mod eds;
 mod emergencies;

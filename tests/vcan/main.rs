@@ -15,6 +15,7 @@
 //! | `many` | two devices, two clients, a second master |
 //! | `commissioning` | scan, init, nmt, sdo: what they send, and that a scan sends nothing |
 //! | `transmitter` | a DST P92C from its box to its values: clash, LSS, configuration, EMCY, loss, no needless write |
+//! | `foreign` | python-canopen as a device known by its EDS alone, as judge of SDO transfers, as a second client |
 //! | `namespace` | a gateway that reaches the bus from a network namespace of its own, as in a container |
 //!
 //! vcan0 is there once, so the tests run one after another; each begins with a new interface.
@@ -43,6 +44,7 @@ mod broker;
 mod commissioning;
 mod examples;
 mod faults;
+mod foreign;
 mod guarding;
 mod harness;
 mod harness_itself;
