@@ -220,12 +220,16 @@ impl Hall {
         if is_sdo(&frame) && self.bad_weather {
             self.sdo[0] += 1;
             delay = Duration::from_micros(u64::try_from(self.random.between(1000, LATEST)).unwrap());
-            if self.random.between(0, 99) < 5 {
-                self.sdo[1] += 1;
-                copies = 0;
-            } else if self.random.between(0, 99) < 5 {
-                self.sdo[2] += 1;
-                copies = 2;
+            match self.random.between(0, 99) {
+                0..5 => {
+                    self.sdo[1] += 1;
+                    copies = 0;
+                }
+                5..10 => {
+                    self.sdo[2] += 1;
+                    copies = 2;
+                }
+                _ => {}
             }
         }
         for _ in 0..copies {
@@ -275,9 +279,9 @@ fn sdo_under_loss_duplication_and_delay_delays_nothing_of_the_other_nodes() {
     let worst = &hall.worst;
     boots.sort_unstable();
     println!(
-        "{:.0} s, {} SDO frames, of these {} lost and {} doubled, up to {} ms late; {errors} transfers failed by name, {} boots \
+        "{} s, {} SDO frames, of these {} lost and {} doubled, up to {} ms late; {errors} transfers failed by name, {} boots \
          took {:.1?} to {:.1?}",
-        hall.now.as_millis() as f64 / 1e3,
+        hall.now.as_millis() / 1000,
         hall.sdo[0],
         hall.sdo[1],
         hall.sdo[2],

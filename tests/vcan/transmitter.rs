@@ -337,9 +337,9 @@ fn a_transmitter_with_the_node_id_of_a_detcon_is_moved_configured_read_and_watch
     give_it(Duration::from_secs(5));
     let timed = capture.timed();
     let period = |id: &str| {
-        let times: Vec<f64> =
+        let seen: Vec<f64> =
             timed[begin..].iter().filter(|(_, frame)| frame.starts_with(id)).map(|(at, _)| *at).collect();
-        (times[times.len() - 1] - times[0]) / (times.len() - 1) as f64
+        (seen[seen.len() - 1] - seen[0]) / f64::from(u32::try_from(seen.len() - 1).unwrap())
     };
     println!("TPDO1 every {:.1} ms, heartbeat every {:.1} ms", period("185#") * 1e3, period("705#") * 1e3);
     assert!((0.09..0.15).contains(&period("185#")) && (0.45..0.7).contains(&period("705#")));
@@ -359,8 +359,8 @@ fn a_transmitter_with_the_node_id_of_a_detcon_is_moved_configured_read_and_watch
     let messages = subscriber.count();
     press.process.kill();
     let lost = subscriber.wait_for_event("node_lost", messages);
-    let last = capture.timed().into_iter().rfind(|(_, frame)| frame.starts_with("705#")).unwrap().0;
-    let took = lost.payload["ts"].as_f64().unwrap() / 1000.0 - last;
+    let heard = capture.timed().into_iter().rfind(|(_, frame)| frame.starts_with("705#")).unwrap().0;
+    let took = lost.payload["ts"].as_f64().unwrap() / 1000.0 - heard;
     println!("node_lost: {took:.3} s after the last heartbeat (heartbeat time 1.5 s)");
     assert!((1.4..2.5).contains(&took), "{took} s");
     subscriber.wait_for("press/availability", messages, |payload| payload["state"] == "offline");
