@@ -25,6 +25,7 @@ use crate::harness::gateway::{Setup, TOPICS, simulate};
 use crate::harness::modbus::{Table, mbpoll};
 use crate::harness::process::Process;
 use crate::harness::wait::{wait_until, within};
+use crate::transmitter::is_write_to;
 
 /// Names how many random sizes are written and read back in each of two tests; 200 unless told. 10000 take half an hour.
 const TRANSFERS: &str = "CANGATE_SDO_TRANSFERS";
@@ -98,17 +99,11 @@ fn a_device_of_python_canopen_works_with_what_import_makes_of_its_eds_and_nothin
         payload["tags"]["analogue_input_level"] == 1234 && payload["tags"]["oil_temperature"] == 61.25
     });
     // Its heartbeat was off; nothing else was written, and it was started by its own id.
-    let sent: Vec<String> = capture.frames().into_iter().filter(|frame| is_write(frame, "607#")).collect();
+    let sent: Vec<String> = capture.frames().into_iter().filter(|frame| is_write_to(frame, "607#")).collect();
     assert_eq!(sent, ["607#2B171000E8030000"]);
     capture.wait_for("000#0107", 0);
     device.kill();
     subscriber.wait_for_event("node_lost", 0);
-}
-
-/// An SDO request that begins to write.
-fn is_write(frame: &str, id: &str) -> bool {
-    let command = frame.strip_prefix(id).and_then(|data| u8::from_str_radix(data.get(..2)?, 16).ok());
-    command.is_some_and(|command| matches!(command & 0xE0, 0x20 | 0xC0))
 }
 
 /// Our SDO client on vcan0: what `cangate sdo` and the gateway are made of, without a process for each transfer.

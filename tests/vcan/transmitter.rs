@@ -81,13 +81,15 @@ fn conversation(frames: &[String]) -> Vec<&str> {
     frames.iter().map(String::as_str).filter(is_spoken).collect()
 }
 
-/// SDO requests that write an object of the transmitter: begin of a download, of a block download.
+/// SDO requests that write an object of the transmitter.
 fn writes(frames: &[String]) -> Vec<&String> {
-    let is_write = |frame: &&String| {
-        let command = frame.strip_prefix("605#").and_then(|data| u8::from_str_radix(data.get(..2)?, 16).ok());
-        command.is_some_and(|command| matches!(command & 0xE0, 0x20 | 0xC0))
-    };
-    frames.iter().filter(is_write).collect()
+    frames.iter().filter(|frame| is_write_to(frame, "605#")).collect()
+}
+
+/// Whether a frame is an SDO request to this identifier that begins to write.
+pub fn is_write_to(frame: &str, id: &str) -> bool {
+    let command = frame.strip_prefix(id).and_then(|data| u8::from_str_radix(data.get(..2)?, 16).ok());
+    command.is_some_and(|command| matches!(command & 0xE0, 0x20 | 0xC0))
 }
 
 #[test]
@@ -186,6 +188,31 @@ fn a_scan_while_a_transmitter_of_the_same_node_id_is_plugged_in_tells_of_the_cla
         ["701#00"],
         "the transmitter's boot-up, and no more"
     );
+}
+
+#[test]
+fn an_active_scan_says_what_it_is_that_shares_its_node_id_with_a_detcon() {
+    let _bus = take_the_bus();
+    let capture = Capture::start();
+    let _detcon = simulator(1, &[]);
+    wait_until("process data", || {
+        cansend("000#0101");
+        capture.frames().iter().any(|frame| frame.starts_with("481#"))
+    });
+    // As the object dictionary of the guide has it: it waits for SYNC and sends no heartbeat, so that nothing is heard of it.
+    let press = simulate("dst-p92c", 1, &[]);
+    wait_until("the transmitter", || {
+        press.stdout(0).iter().any(|line| line.text.ends_with("pre_operational"))
+    });
+    let (code, stdout, stderr) =
+        cangate(&["scan", "-i", BUS, "--active", "--seconds", "2", "--nodes", "1-3"]);
+    assert_eq!(code, 0, "{stderr}");
+    println!("{stdout}");
+    assert!(stdout.contains("! two devices may share node id 1"), "{stdout}");
+    assert!(stdout.contains("DST P92C") && stdout.contains("DetCon"), "{stdout}");
+    let asked: Vec<String> =
+        capture.frames().into_iter().filter(|frame| is_write_to(frame, "601#")).collect();
+    assert_eq!(asked, Vec::<String>::new(), "it writes nothing");
 }
 
 #[test]
