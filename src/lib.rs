@@ -42,8 +42,9 @@
 //! 5. Every queue has a bound and says what happens when it is full.
 //! 6. No value without quality and time.
 //! 7. Nothing from a network can panic the process.
-//! 8. Of the gateway, only `canopen` builds frames, and only frames of the kinds that the configuration allows leave. (The
-//!    simulator, which is a device, builds its own.)
+//! 8. Of the gateway, only `canopen` builds frames, and only frames of the kinds that the configuration allows leave: NMT
+//!    commands, guard requests and SDO requests to its nodes; SYNC, TIME and RPDOs only where it asks for them; in the passive
+//!    role none. (The simulator, which is a device, builds its own.)
 //!
 //! ## The seam
 //!

@@ -183,8 +183,8 @@ mod tests {
         }])
     }
 
-    fn data(byte: u8) -> Option<[u8; 8]> {
-        Some([byte, 0, 0, 0, 0, 0, 0, 0])
+    fn set(rpdos: &mut Rpdos, millis: u64, byte: u8) {
+        rpdos.set_data(at(millis), RpdoIndex(0), Some([byte, 0, 0, 0, 0, 0, 0, 0]));
     }
 
     /// What is sent up to a time, as `time frame`.
@@ -204,7 +204,7 @@ mod tests {
         assert!(rpdos.set_running(at(0), true));
         assert_eq!(run(&mut rpdos, 1000), Vec::<String>::new(), "no data");
         rpdos.set_running(at(1000), false);
-        rpdos.set_data(at(1000), RpdoIndex(0), data(7));
+        set(&mut rpdos, 1000, 7);
         assert_eq!(run(&mut rpdos, 2000), Vec::<String>::new(), "not running");
         assert!(rpdos.set_running(at(2000), true));
         assert!(!rpdos.set_running(at(2001), true));
@@ -219,12 +219,12 @@ mod tests {
         rpdos.set_running(at(0), true);
         let mut sent = Vec::new();
         for millis in 0..35_u8 {
-            rpdos.set_data(at(millis.into()), RpdoIndex(0), data(millis));
+            set(&mut rpdos, millis.into(), millis);
             sent.extend(run(&mut rpdos, millis.into()));
         }
         assert_eq!(sent, ["0 201#0000", "10 201#0A00", "20 201#1400", "30 201#1E00"]);
         assert_eq!(run(&mut rpdos, 60_000), ["40 201#2200"], "the last one is not lost");
-        rpdos.set_data(at(70_000), RpdoIndex(0), data(34));
+        set(&mut rpdos, 70_000, 34);
         assert_eq!(run(&mut rpdos, 80_000), Vec::<String>::new(), "no change, no frame");
     }
 
@@ -232,7 +232,7 @@ mod tests {
     fn a_node_that_takes_it_otherwise_is_sent_nothing() {
         let mut rpdos = one(RpdoTrigger::Event, Some(100));
         rpdos.set_agreed(at(0), RpdoIndex(0), false);
-        rpdos.set_data(at(0), RpdoIndex(0), data(1));
+        set(&mut rpdos, 0, 1);
         rpdos.set_running(at(0), true);
         assert_eq!(run(&mut rpdos, 1000), Vec::<String>::new());
         rpdos.set_agreed(at(1000), RpdoIndex(0), true);
@@ -244,11 +244,11 @@ mod tests {
         for (every, expected) in [(1, vec![1, 2, 3, 4, 5, 6]), (3, vec![3, 6]), (0, vec![1, 4])] {
             let mut rpdos = one(RpdoTrigger::Sync(every), None);
             rpdos.set_running(at(0), true);
-            rpdos.set_data(at(0), RpdoIndex(0), data(1));
+            set(&mut rpdos, 0, 1);
             let mut after = Vec::new();
             for sync in 1..=6 {
                 if sync == 4 {
-                    rpdos.set_data(at(350), RpdoIndex(0), data(2));
+                    set(&mut rpdos, 350, 2);
                 }
                 assert_eq!(rpdos.take_due(at(100 * sync - 1)), None, "not between two");
                 rpdos.handle_sync(at(100 * sync));
@@ -262,11 +262,11 @@ mod tests {
     fn a_change_that_did_not_leave_is_sent_again_with_what_holds_then() {
         let mut rpdos = one(RpdoTrigger::Event, None);
         rpdos.set_running(at(0), true);
-        rpdos.set_data(at(0), RpdoIndex(0), data(1));
+        set(&mut rpdos, 0, 1);
         let Sent { frame, .. } = rpdos.take_due(at(0)).unwrap();
         assert_eq!(rpdos.handle_not_sent(at(0), &frame), Some(RpdoIndex(0)));
         assert_eq!(rpdos.handle_not_sent(at(0), &"181#01".parse().unwrap()), None);
-        rpdos.set_data(at(50), RpdoIndex(0), data(2));
+        set(&mut rpdos, 50, 2);
         assert_eq!(run(&mut rpdos, 1000), ["50 201#0200"]);
         let frame = "201#0200".parse().unwrap();
         rpdos.handle_not_sent(at(1000), &frame);

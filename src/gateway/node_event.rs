@@ -1,5 +1,7 @@
 //! What each event of a node does: to its tags, its counters, its status, its alarms and the journal.
 
+use std::time::Duration;
+
 use super::Gateway;
 use super::events::Name;
 use super::node::{Loss, Node};
@@ -28,12 +30,7 @@ impl Gateway {
                 self.pdo_length(at, pdo, received, discarded);
             }
             NodeEvent::PdoTimeout { pdo } => self.pdo_timeout(at, pdo),
-            NodeEvent::PdoOutsideWindow { pdo, after } => {
-                let number = self.pdo_number(index, pdo);
-                self.tell(at, "pdo_outside_window", |event| {
-                    event.text = format!("TPDO{number} came {} us after SYNC", after.as_micros());
-                });
-            }
+            NodeEvent::PdoOutsideWindow { pdo, after } => self.pdo_outside_window(at, pdo, after),
             NodeEvent::RpdosStarted => self.rpdos_started(at),
             NodeEvent::RpdosStopped => self.rpdos_stopped(at),
             NodeEvent::RpdoSent { rpdo, data } => return self.rpdo_sent(at, rpdo, data),
@@ -210,6 +207,13 @@ impl Gateway {
         self.look_for_silence(now, index);
         let number = self.pdo_number(index, pdo);
         self.tell(at, "pdo_timeout", |event| event.text = format!("TPDO{number} did not come in time"));
+    }
+
+    fn pdo_outside_window(&mut self, at: (Now, NodeIndex), pdo: PdoIndex, after: Duration) {
+        let number = self.pdo_number(at.1, pdo);
+        self.tell(at, "pdo_outside_window", |event| {
+            event.text = format!("TPDO{number} came {} us after SYNC", after.as_micros());
+        });
     }
 
     fn pdo_in_unexpected_state(&mut self, at: (Now, NodeIndex), pdo: PdoIndex, state: Option<NmtState>) {

@@ -374,29 +374,30 @@ impl<'a> Tpdo<'a> {
     }
 
     /// Its transmission type, with the file that it stands in.
-    pub fn transmission_type<'c>(&self, context: &'c Context<'_>) -> Option<(&'c SourceText, &'a At<u64>)> {
-        self.key_of(context, |changes| &changes.transmission_type, &self.section.transmission_type)
+    pub fn transmission_type<'c>(&self, context: &'c Context<'_>) -> Option<(&'c SourceText, &'c At<u64>)>
+    where
+        'a: 'c,
+    {
+        let changed = self.changes.and_then(|changes| changes.transmission_type.as_ref());
+        either(context, changed, self.section.transmission_type.as_ref())
     }
 
     /// Its event timer.
-    pub fn event_timer<'c>(&self, context: &'c Context<'_>) -> Option<(&'c SourceText, &'a At<u64>)> {
-        self.key_of(context, |changes| &changes.event_timer_ms, &self.section.event_timer_ms)
+    pub fn event_timer<'c>(&self, context: &'c Context<'_>) -> Option<(&'c SourceText, &'c At<u64>)>
+    where
+        'a: 'c,
+    {
+        let changed = self.changes.and_then(|changes| changes.event_timer_ms.as_ref());
+        either(context, changed, self.section.event_timer_ms.as_ref())
     }
 
     /// Its inhibit time.
-    pub fn inhibit_time<'c>(&self, context: &'c Context<'_>) -> Option<(&'c SourceText, &'a At<u64>)> {
-        self.key_of(context, |changes| &changes.inhibit_time_us, &self.section.inhibit_time_us)
-    }
-
-    fn key_of<'c>(
-        &self,
-        context: &'c Context<'_>,
-        changed: impl Fn(&'a TpdoEntry) -> &'a Option<At<u64>>,
-        own: &'a Option<At<u64>>,
-    ) -> Option<(&'c SourceText, &'a At<u64>)> {
-        let changed = self.changes.and_then(|changes| changed(changes).as_ref());
-        let changed = changed.map(|at| (context.config, at));
-        changed.or(own.as_ref().map(|at| (context.source, at)))
+    pub fn inhibit_time<'c>(&self, context: &'c Context<'_>) -> Option<(&'c SourceText, &'c At<u64>)>
+    where
+        'a: 'c,
+    {
+        let changed = self.changes.and_then(|changes| changes.inhibit_time_us.as_ref());
+        either(context, changed, self.section.inhibit_time_us.as_ref())
     }
 
     /// Whether it is taken as the device has it.

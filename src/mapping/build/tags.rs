@@ -197,20 +197,19 @@ fn from_pdo(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, sec
         return finished(problems, context, item, section.shared(), usual_decimals, source);
     }
     let scale = scale(problems, context, section.scale.as_ref());
-    let mut source = match &section.rpdo {
-        Some(rpdo) => rpdo::source(problems, context, item, section, rpdo, scale),
-        None => {
-            rpdo::refuse_limits(problems, context, section);
-            let (pdo, field) = fields::field(problems, context, item, section);
-            let poll = fields::poll(context, item).zip(fields::whole(section));
-            match (node::adopted(context, section), poll) {
-                (Some(object), poll) => {
-                    let field = Field { bit: 0, ..field };
-                    Source::Adopted { object, poll: poll.map(|(poll, _)| poll), field, scale }
-                }
-                (None, Some((poll, field))) => Source::Polled { poll, field, scale },
-                (None, None) => Source::Pdo { pdo, field, scale },
+    let mut source = if let Some(rpdo) = &section.rpdo {
+        rpdo::source(problems, context, item, section, rpdo, scale)
+    } else {
+        rpdo::refuse_limits(problems, context, section);
+        let (pdo, field) = fields::field(problems, context, item, section);
+        let poll = fields::poll(context, item).zip(fields::whole(section));
+        match (node::adopted(context, section), poll) {
+            (Some(object), poll) => {
+                let field = Field { bit: 0, ..field };
+                Source::Adopted { object, poll: poll.map(|(poll, _)| poll), field, scale }
             }
+            (None, Some((poll, field))) => Source::Polled { poll, field, scale },
+            (None, None) => Source::Pdo { pdo, field, scale },
         }
     };
     let mut is_float = false;
