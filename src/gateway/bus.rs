@@ -495,6 +495,9 @@ impl Gateway {
 /// What the first frame of an identifier of nobody's may mean. `known`: its node id is that of a configured node.
 fn stranger(id: CanId, node: Option<NodeId>, known: bool) -> String {
     let Some(node) = node else { return format!("{id} belongs to no configured node") };
+    if known && is_rpdo(id) {
+        return format!("somebody else sends node {node} process data, {id}");
+    }
     if known {
         return format!(
             "{id} stands for node {node}, but the mapping of that node does not know it: it leaves something out, or \
@@ -508,6 +511,11 @@ fn stranger(id: CanId, node: Option<NodeId>, known: bool) -> String {
         );
     }
     format!("{id} comes from node {node}, which is not configured")
+}
+
+/// Whether an identifier is that of an RPDO of the predefined connection set: what a master sends its nodes.
+fn is_rpdo(id: CanId) -> bool {
+    matches!(id, CanId::Standard(id) if matches!(id >> 7, 4 | 6 | 8 | 10))
 }
 
 fn state(link: Link) -> BusState {

@@ -195,7 +195,8 @@ fn frames_of_nobodys_are_told_with_what_they_may_mean_and_no_alarm() {
             "heartbeat, boot-up message or guard request of node 127, which is not configured: another master",
         ),
         ("185#00", "185 comes from node 5, which is not configured"),
-        ("201#00", "201 belongs to no configured node"),
+        ("201#00", "somebody else sends node 1 process data, 201"),
+        ("7F0#00", "7F0 belongs to no configured node"),
         ("581#6017100000000000", "581 stands for node 1, but the mapping of that node does not know it"),
     ] {
         conversation.frame(frame);
