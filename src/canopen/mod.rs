@@ -52,6 +52,7 @@ pub use cob_id::NodeId;
 pub use event::{ForeignEvent, NetworkOutput, NodeEvent};
 pub use network::Network;
 pub use nmt::{NmtRequest, NmtState};
+pub use node::SdoRefused;
 pub use settings::{
     ErrorControl, GuardingSettings, NetworkSettings, NodeSettings, PdoIndex, PdoSettings, Role, RpdoIndex,
     RpdoSettings, RpdoTrigger, StartSettings, SyncSettings, TimeSettings, TogglePolicy,

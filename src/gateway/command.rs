@@ -1,7 +1,16 @@
 //! What a northbound can ask for. Checked here, whoever asks; written to the journal, whatever comes of it.
+//!
+//! - [`desk`] \[IO\]: where northbounds hand in their requests.
 
-use crate::canopen::NmtRequest;
+pub mod desk;
+
+use std::time::Duration;
+
+pub use crate::canopen::NmtRequest;
+pub use crate::canopen::object::ObjectId;
+pub use crate::canopen::sdo::AbortCode;
 use crate::process_image::{AlarmIndex, NodeIndex, TagIndex, Value};
+pub use desk::Desk;
 
 /// A request.
 #[derive(Clone, Debug, PartialEq)]
@@ -23,6 +32,8 @@ pub enum CommandSource {
     Mqtt(String),
     /// A user of the page or the HTTP interface.
     Web(String),
+    /// A client of the CiA 309-3 gateway, by its address.
+    Cia309(String),
 }
 
 /// What is asked for.
@@ -58,6 +69,29 @@ pub enum Action {
         /// The alarm.
         alarm: AlarmIndex,
     },
+    /// An object of a node is read by SDO. Answered with [`Outcome::Read`] when the node has answered; not journalled unless
+    /// it fails, as it changes nothing.
+    SdoRead {
+        /// The node.
+        node: NodeIndex,
+        /// Which object.
+        object: ObjectId,
+        /// How many bytes it has, where the asker knows: some devices do not say how many of four bytes count.
+        len: Option<usize>,
+        /// How long the node may take for each answer; `None` = as the gateway's own requests.
+        timeout: Option<Duration>,
+    },
+    /// An object of a node is written by SDO, once. Answered with [`Outcome::Done`] when the node has confirmed it.
+    SdoWrite {
+        /// The node.
+        node: NodeIndex,
+        /// Which object.
+        object: ObjectId,
+        /// Its bytes, little-endian as its type has them.
+        data: Vec<u8>,
+        /// As for `SdoRead`.
+        timeout: Option<Duration>,
+    },
 }
 
 /// What came of it.
@@ -73,4 +107,12 @@ pub enum Outcome {
     Busy,
     /// The node cannot take it now.
     NodeUnavailable,
+    /// The object was read: its bytes, little-endian.
+    Read(Vec<u8>),
+    /// The node refused the transfer.
+    Aborted(AbortCode),
+    /// The node did not answer in time. A write may have been done or not.
+    Timeout,
+    /// The transfer broke off for another reason; which. A write may have been done or not.
+    Failed(String),
 }

@@ -8,6 +8,7 @@ use super::conditions::Conditions;
 use super::events::{EventLog, Name};
 use super::marks::Marks;
 use super::node::Node;
+use super::objects::Transfers;
 use super::operate::Finished;
 use super::supply::Supply;
 use super::tags::{CarrierIndex, Tags};
@@ -81,6 +82,7 @@ pub struct Gateway {
     pub(super) outputs: VecDeque<Output>,
     /// Commands that are answered when all outputs were taken. No more than were asked for by one input.
     pub(super) finished: Vec<Finished>,
+    pub(super) transfers: Transfers,
     /// When alarms that are held back are to be looked at again.
     pub(super) next_look: Option<Instant>,
     /// When the data of a TPDO may be too old.
@@ -106,6 +108,7 @@ impl Gateway {
             dirty_buses: Marks::new(table.buses.len()),
             outputs: VecDeque::new(),
             finished: Vec::new(),
+            transfers: Transfers::default(),
             next_look: None,
             next_expiry: None,
             nodes,

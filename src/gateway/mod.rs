@@ -4,6 +4,7 @@
 //! `publish` into the process image, then wait.
 //!
 //! - [`command`]: what a northbound can ask for. `operate`: what comes of it.
+//! - `objects`: objects of nodes that northbounds read and write.
 //! - `core`: the four verbs.
 //! - `bus`: one bus; `node` and `node_event`: one node; `emergency`: its errors.
 //! - `supply`: what nodes are sent in RPDOs.
@@ -26,6 +27,7 @@ mod fixture;
 mod marks;
 mod node;
 mod node_event;
+mod objects;
 mod operate;
 pub mod replay;
 mod supply;
@@ -33,5 +35,5 @@ mod tags;
 pub mod task;
 mod units;
 
-pub use command::{Action, Command, CommandSource, Outcome};
+pub use command::{Action, Command, CommandSource, Desk, Outcome};
 pub use core::{Gateway, Health, Input, Output};

@@ -22,8 +22,7 @@ impl Gateway {
         match *event {
             NodeEvent::Boot(ref told) => self.boot_event(at, told),
             NodeEvent::Polled { poll, ref result } => self.polled(at, poll, result),
-            // Nobody asks for transfers but the boot, which keeps its results to itself.
-            NodeEvent::Sdo { .. } => {}
+            NodeEvent::Sdo { id, ref result } => self.transfer_done(now, id, result),
             NodeEvent::FrameSeen => return self.frame_seen(at),
             NodeEvent::Pdo { pdo, data, length } => return self.pdo(at, pdo, data, length),
             NodeEvent::PdoLength { pdo, received, discarded } => {

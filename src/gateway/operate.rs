@@ -2,10 +2,12 @@
 
 use super::core::{Gateway, Output};
 use super::node_event::request_word;
+use super::objects::Asked;
 use super::supply::Undo;
 use super::{Action, Command, CommandSource, Outcome};
 use crate::alarms::AcknowledgeError;
 use crate::can::{BusIndex, CanFrame};
+use crate::canopen::sdo::SdoRequest;
 use crate::canopen::{NmtRequest, Role, cob_id};
 use crate::mapping::AlarmOwner;
 use crate::process_image::{AlarmIndex, NodeIndex};
@@ -36,6 +38,16 @@ impl Gateway {
         let Command { id, source, action } = command;
         let (mut frame, mut undo) = (None, None);
         let (name, about, outcome, what) = match action {
+            Action::SdoRead { node, object, len, timeout } => {
+                let request = SdoRequest { len, timeout, ..SdoRequest::read(object) };
+                self.request_object(now, (id, source), node, request);
+                return self.settle(now);
+            }
+            Action::SdoWrite { node, object, data, timeout } => {
+                let request = SdoRequest { timeout, ..SdoRequest::write(object, data) };
+                self.request_object(now, (id, source), node, request);
+                return self.settle(now);
+            }
             Action::Nmt { node, request } => {
                 let outcome = self.request_nmt(now, node, request, &mut frame);
                 ("nmt", self.owner_of_node(node), outcome, request_word(request).to_owned())
@@ -99,14 +111,17 @@ impl Gateway {
             self.events.record_command(at, about, name, |event| {
                 event.from = source_text(&source);
                 outcome_word(&outcome).clone_into(&mut event.to);
-                event.text = match &outcome {
-                    Outcome::Rejected(reason) if what.is_empty() => reason.clone(),
-                    Outcome::Rejected(reason) => format!("{what}: {reason}"),
-                    Outcome::Done | Outcome::Unknown | Outcome::Busy | Outcome::NodeUnavailable => what,
-                };
+                event.text = told(&outcome, what);
             });
             self.outputs.push_back(Output::Reply { id, outcome });
         }
+    }
+
+    /// A write by SDO is over, or was not even begun.
+    pub(super) fn finish_write(&mut self, at: Now, asked: Asked, outcome: Outcome) {
+        let Asked { id, source, node, what, .. } = asked;
+        let about = self.owner_of_node(node);
+        self.finished.push(Finished { id, at, source, name: "sdo_write", about, what, outcome, frame: None, undo: None });
     }
 
     /// `frame` becomes the one that carries the command.
@@ -154,7 +169,7 @@ impl Gateway {
         Outcome::Done
     }
 
-    fn owner_of_node(&self, node: NodeIndex) -> AlarmOwner {
+    pub(super) fn owner_of_node(&self, node: NodeIndex) -> AlarmOwner {
         if node.0 < self.table.nodes.len() { AlarmOwner::Node(node) } else { AlarmOwner::Gateway }
     }
 
@@ -167,20 +182,40 @@ impl Gateway {
     }
 }
 
-fn source_text(source: &CommandSource) -> String {
+/// What was asked for, and why it was not done.
+pub(super) fn told(outcome: &Outcome, what: String) -> String {
+    let reason = match outcome {
+        Outcome::Rejected(reason) | Outcome::Failed(reason) => reason.clone(),
+        Outcome::Aborted(code) => code.to_string(),
+        Outcome::Done
+        | Outcome::Unknown
+        | Outcome::Busy
+        | Outcome::NodeUnavailable
+        | Outcome::Read(_)
+        | Outcome::Timeout => return what,
+    };
+    if what.is_empty() { reason } else { format!("{what}: {reason}") }
+}
+
+pub(super) fn source_text(source: &CommandSource) -> String {
     match source {
         CommandSource::Modbus(who) => format!("modbus {who}"),
         CommandSource::Mqtt(who) => format!("mqtt {who}"),
         CommandSource::Web(who) => format!("web {who}"),
+        CommandSource::Cia309(who) => format!("cia309 {who}"),
     }
 }
 
-fn outcome_word(outcome: &Outcome) -> &'static str {
+pub(super) fn outcome_word(outcome: &Outcome) -> &'static str {
     match outcome {
         Outcome::Done => "done",
         Outcome::Unknown => "unknown",
         Outcome::Rejected(_) => "rejected",
         Outcome::Busy => "busy",
         Outcome::NodeUnavailable => "node_unavailable",
+        Outcome::Read(_) => "read",
+        Outcome::Aborted(_) => "aborted",
+        Outcome::Timeout => "timeout",
+        Outcome::Failed(_) => "failed",
     }
 }

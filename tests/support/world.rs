@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use cangate::can::{BusEvent, BusIndex, CanFrame, Link};
 use cangate::canopen::NodeId;
-use cangate::gateway::{Gateway, Input, Output};
+use cangate::gateway::{Action, Command, CommandSource, Gateway, Input, Outcome, Output};
 use cangate::mapping::{Sketch, Source, TagTable};
 use cangate::process_image::{NodeIndex, NodeStatus, ProcessImage, Quality, Sample};
 use cangate::simulator::random::Random;
@@ -68,6 +68,9 @@ pub struct World {
     pub raised: BTreeSet<String>,
     /// The last event that was looked at.
     cursor: u64,
+    /// What came of commands, by their numbers.
+    replies: BTreeMap<u64, Outcome>,
+    commands: u64,
 }
 
 impl World {
@@ -93,6 +96,8 @@ impl World {
             log: None,
             raised: BTreeSet::new(),
             cursor: 0,
+            replies: BTreeMap::new(),
+            commands: 0,
         }
     }
 
@@ -250,7 +255,9 @@ impl World {
                     self.sent.insert(frame.to_string());
                     self.send(Sender::Gateway, frame);
                 }
-                Output::Reply { .. } => {}
+                Output::Reply { id, outcome } => {
+                    assert!(self.replies.insert(id, outcome).is_none(), "one answer to each request");
+                }
             }
         }
         gateway.publish(&mut self.image);
@@ -287,6 +294,38 @@ impl World {
 
     fn index(&self, id: u8) -> NodeIndex {
         self.table.find_node(&format!("node{id:03}")).unwrap()
+    }
+
+    /// Asks the gateway for something; gives the number of the request.
+    pub fn command(&mut self, action: Action) -> u64 {
+        self.commands += 1;
+        let source = CommandSource::Cia309("test".into());
+        let (id, now) = (self.commands, self.now());
+        let command = Command { id, source, action };
+        self.gateway.as_mut().expect("a gateway").handle_input(now, Input::Command(command));
+        self.settle();
+        id
+    }
+
+    /// The answer to a request, where there is one by now.
+    pub fn reply(&mut self, id: u64) -> Option<Outcome> {
+        self.replies.remove(&id)
+    }
+
+    /// Asks the gateway for something and lets time pass until it answers.
+    #[track_caller]
+    pub fn ask(&mut self, action: Action) -> Outcome {
+        let id = self.command(action);
+        self.run_until(130_000, |world| world.replies.contains_key(&id));
+        self.replies.remove(&id).unwrap()
+    }
+
+    /// The link of the bus changes.
+    pub fn link(&mut self, link: Link) {
+        let now = self.now();
+        let event = BusEvent::Link { link, at: now };
+        self.gateway.as_mut().expect("a gateway").handle_input(now, Input::Bus { bus: BUS, event });
+        self.settle();
     }
 
     /// What the gateway knows of a node.

@@ -108,6 +108,11 @@ impl Boot {
         self.phase == Phase::Done
     }
 
+    /// Whether it is asking or changing the node just now: nobody else should come between.
+    pub(super) fn is_under_way(&self) -> bool {
+        matches!(self.phase, Phase::Running | Phase::Settling(_))
+    }
+
     /// The node booted: everything anew.
     pub(super) fn handle_boot_up(&mut self, now: Instant) {
         self.failures = 0;

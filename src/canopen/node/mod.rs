@@ -91,6 +91,9 @@ pub enum SdoRefused {
     /// A stopped node answers no SDO (CiA 301, R-DST-071).
     #[error("the node is stopped; in that state it answers no SDO")]
     Stopped,
+    /// The gateway is identifying or configuring the node; that takes some hundred milliseconds.
+    #[error("the node is being configured; try again in a moment")]
+    Booting,
     /// The client does not take it.
     #[error(transparent)]
     Client(#[from] Refused),

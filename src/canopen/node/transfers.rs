@@ -27,6 +27,9 @@ impl Node {
         if self.state == Some(NmtState::Stopped) {
             return Err(SdoRefused::Stopped);
         }
+        if self.boot.is_under_way() {
+            return Err(SdoRefused::Booting);
+        }
         self.sdo.as_mut().ok_or(SdoRefused::NoSdo)?.request(now, id, request)?;
         self.transfer(now, outputs);
         Ok(())

@@ -260,7 +260,8 @@ impl SdoClient {
         }
         let Some((id, request)) = self.boot.pop_front().or_else(|| self.commands.pop_front()) else { return };
         let slow = request.action != SdoAction::Read && SLOW_OBJECTS.contains(&request.object.index);
-        let timeout = if slow { self.settings.store_timeout } else { self.settings.timeout };
+        let usual = if slow { self.settings.store_timeout } else { self.settings.timeout };
+        let timeout = request.timeout.unwrap_or(usual);
         self.active = Some(Active {
             id,
             repeatable: request.idempotent || request.action == SdoAction::Read,

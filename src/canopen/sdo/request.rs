@@ -54,6 +54,8 @@ pub struct SdoRequest {
     /// How long the object is, in bytes, where the caller knows: some devices answer with four bytes without saying how
     /// many of them count.
     pub len: Option<usize>,
+    /// How long each answer may take, where it is not as long as the [`SdoSettings`] say.
+    pub timeout: Option<Duration>,
 }
 
 /// Read or write.
@@ -80,14 +82,14 @@ impl SdoRequest {
     #[must_use]
     pub const fn read(object: ObjectId) -> Self {
         let (idempotent, priority) = (true, SdoPriority::Command);
-        Self { object, action: SdoAction::Read, idempotent, priority, len: None }
+        Self { object, action: SdoAction::Read, idempotent, priority, len: None, timeout: None }
     }
 
     /// Writes an object, once, with the priority of a command.
     #[must_use]
     pub const fn write(object: ObjectId, data: Vec<u8>) -> Self {
         let (idempotent, priority) = (false, SdoPriority::Command);
-        Self { object, action: SdoAction::Write(data), idempotent, priority, len: None }
+        Self { object, action: SdoAction::Write(data), idempotent, priority, len: None, timeout: None }
     }
 
     /// The same, before all commands that wait.
