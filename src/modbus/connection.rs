@@ -1,14 +1,20 @@
 //! One client: reads requests, answers them in order, knows when to give up. \[IO\]
+//!
+//! Registers are answered at once. An object of a node takes as long as the node does; the requests behind it wait.
 
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio_util::sync::CancellationToken;
 
 use super::counters::{Counters, End};
-use super::frame::{self, LONGEST_FRAME, Parsed};
+use super::frame::{self, Frame, LONGEST_FRAME, Parsed};
+use super::general_reference::{self, Reference};
+use super::pdu::{self, ExceptionCode};
 use super::register_bank::RegisterBank;
 use super::service;
+use crate::gateway::command::{CommandSource, Desk};
 use crate::process_image::ImageReader;
 use crate::slots::Activity;
 use crate::time::Clock;
@@ -30,6 +36,17 @@ pub struct Shared {
     pub partial_frame_timeout: Duration,
     /// How long an answer may wait.
     pub send_timeout: Duration,
+    /// FC 43/13, where it is offered.
+    pub objects: Option<Objects>,
+}
+
+/// Objects of nodes.
+#[derive(Clone, Debug)]
+pub struct Objects {
+    /// Where the gateway is asked.
+    pub desk: Desk,
+    /// They may be written too.
+    pub write: bool,
 }
 
 /// Bytes that are read ahead: several requests that a client sent without waiting.
@@ -39,13 +56,13 @@ const INPUT: usize = 4_096;
 const OUTPUT: usize = 16_384;
 
 /// Serves a client until it, the network, a time-out or one of `stops` ends it.
-pub async fn serve<S>(stream: S, shared: &Shared, activity: &Activity, stops: &Stops) -> End
+pub async fn serve<S>(stream: S, peer: SocketAddr, shared: &Shared, activity: &Activity, stops: &Stops) -> End
 where
     S: AsyncReadExt + AsyncWriteExt + Unpin,
 {
     let input = vec![0; INPUT];
     let output = Vec::with_capacity(OUTPUT + LONGEST_FRAME);
-    let mut connection = Connection { stream, shared, activity, input, filled: 0, output };
+    let mut connection = Connection { stream, peer, shared, activity, input, filled: 0, output };
     tokio::select! {
         end = connection.run() => end,
         () = stops.evict.cancelled() => End::Evicted,
@@ -64,6 +81,7 @@ pub struct Stops {
 
 struct Connection<'a, S> {
     stream: S,
+    peer: SocketAddr,
     shared: &'a Shared,
     activity: &'a Activity,
     /// Of fixed length; `filled` bytes of it are not answered yet.
@@ -78,8 +96,18 @@ enum Progress {
     Done { any: bool },
     /// There may be more, but the answers must leave first.
     Full,
+    /// The next answer takes its time; those before it are to leave.
+    Object(Asked),
     /// What came is no Modbus.
     Malformed,
+}
+
+/// A request for an object.
+struct Asked {
+    transaction: u16,
+    unit: u8,
+    /// `None`: it is not well formed.
+    reference: Option<Reference>,
 }
 
 impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
@@ -93,6 +121,10 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
                 }
                 match progress {
                     Progress::Full => partial_until = None,
+                    Progress::Object(asked) => {
+                        partial_until = None;
+                        self.answer_object(&asked).await;
+                    }
                     Progress::Malformed => return End::Malformed,
                     Progress::Done { any } => {
                         if any || self.filled == 0 {
@@ -143,6 +175,9 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
                 }
                 Parsed::Frame(request) => {
                     used += request.length();
+                    if let Some(asked) = self.object_request(&request) {
+                        break Progress::Object(asked);
+                    }
                     let Shared { bank, reader, clock, counters, .. } = self.shared;
                     let now = clock.now();
                     let output = &mut self.output;
@@ -156,6 +191,44 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
         self.input.copy_within(used..self.filled, 0);
         self.filled -= used;
         progress
+    }
+
+    /// Whether a request is for an object, and is to be asked of the gateway. One that is wrong is answered at once.
+    fn object_request(&self, request: &Frame<'_>) -> Option<Asked> {
+        self.shared.objects.as_ref().filter(|_| general_reference::is_general_reference(request.pdu))?;
+        let reference = general_reference::decode(request.pdu).ok();
+        Some(Asked { transaction: request.transaction, unit: request.unit, reference })
+    }
+
+    /// Appends the answer to a request for an object, once the gateway has given it.
+    async fn answer_object(&mut self, asked: &Asked) {
+        let result = self.ask_for_object(asked).await;
+        let mut exception = None;
+        frame::write(&mut self.output, asked.transaction, asked.unit, |out| match result {
+            Ok(pdu) => out.extend_from_slice(&pdu),
+            Err(code) => {
+                pdu::write_exception(out, pdu::ENCAPSULATED, code);
+                exception = Some(code);
+            }
+        });
+        self.shared.counters.request(exception);
+        self.activity.touch(self.shared.clock.now().instant);
+    }
+
+    /// In the order of the other functions: unit (0B), value (03), address (02).
+    async fn ask_for_object(&self, asked: &Asked) -> Result<Vec<u8>, ExceptionCode> {
+        let Shared { bank, objects, .. } = self.shared;
+        let objects = objects.as_ref().ok_or(ExceptionCode::IllegalFunction)?;
+        bank.map().unit(asked.unit).ok_or(ExceptionCode::GatewayTargetDevice)?;
+        let reference = asked.reference.as_ref().ok_or(ExceptionCode::IllegalDataValue)?;
+        if reference.writes() && !objects.write {
+            return Err(ExceptionCode::IllegalDataValue);
+        }
+        let action = reference.action(bank.table(), asked.unit)?;
+        let outcome = objects.desk.ask(CommandSource::Modbus(self.peer.to_string()), action).await;
+        let mut pdu = Vec::new();
+        reference.answer(&outcome, &mut pdu)?;
+        Ok(pdu)
     }
 
     /// Sends all answers at once.
@@ -196,6 +269,7 @@ pub(super) mod tests {
             idle_timeout: None,
             partial_frame_timeout: settings.partial_frame_timeout(),
             send_timeout: settings.send_timeout(),
+            objects: None,
         }
     }
 
@@ -214,7 +288,8 @@ pub(super) mod tests {
         });
         let activity = Slots::new(1).take([127, 0, 0, 1].into(), ()).activity;
         let stops = Stops { evict: CancellationToken::new(), stop: CancellationToken::new() };
-        assert_eq!(serve(near, &shared, &activity, &stops).await, End::SlowClient);
+        let peer = SocketAddr::from(([127, 0, 0, 1], 1));
+        assert_eq!(serve(near, peer, &shared, &activity, &stops).await, End::SlowClient);
         assert_eq!(shared.clock.now().instant.as_millis(), 5_000);
         let answered = usize::try_from(shared.counters.values().requests).unwrap();
         assert!(answered <= OUTPUT / 209 + 1, "{answered} answers");

@@ -10,7 +10,7 @@
 //!
 //! How it is asked for, pure:
 //! - [`frame`]: the MBAP header. [`pdu`]: requests; every length is checked before it is used.
-//! - [`identification`]: FC 43/14. [`service`]: from a request to its answer.
+//! - [`general_reference`]: FC 43/13, objects of nodes. [`identification`]: FC 43/14. [`service`]: from a request to its answer.
 //!
 //! On the network:
 //! - [`server`] \[IO\]: listens, accepts, limits. [`connection`] \[IO\]: one client.
@@ -23,6 +23,7 @@ pub mod encoding;
 pub mod event_ring;
 pub mod frame;
 pub mod gateway_block;
+pub mod general_reference;
 pub mod heartbeat;
 pub mod identification;
 pub mod map_st;
@@ -43,4 +44,4 @@ pub use points::{MapDocument, Point, Table};
 pub use register_bank::RegisterBank;
 pub use register_map::{MapError, RegisterMap};
 pub use server::{BindError, Server};
-pub use settings::{ModbusSettings, SettingsError, WordOrder};
+pub use settings::{ModbusSettings, ObjectAccess, SettingsError, WordOrder};

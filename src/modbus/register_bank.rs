@@ -28,6 +28,12 @@ impl RegisterBank {
         Self { table, map, heartbeats }
     }
 
+    /// Nodes and tags.
+    #[must_use]
+    pub fn table(&self) -> &TagTable {
+        &self.table
+    }
+
     /// The register map.
     #[must_use]
     pub fn map(&self) -> &RegisterMap {

@@ -12,10 +12,11 @@ use tokio::task::{JoinError, JoinSet};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use super::ModbusSettings;
-use super::connection::{self, Shared, Stops};
+use super::connection::{self, Objects, Shared, Stops};
 use super::counters::{Counters, End};
 use super::register_bank::RegisterBank;
+use super::{ModbusSettings, ObjectAccess};
+use crate::gateway::command::Desk;
 use crate::process_image::ImageReader;
 use crate::slots::{SlotId, Slots};
 use crate::time::Clock;
@@ -25,7 +26,9 @@ use crate::time::Clock;
 pub struct Server {
     listeners: Vec<TcpListener>,
     max_connections: usize,
-    shared: Arc<Shared>,
+    shared: Shared,
+    /// What is done with a desk, once there is one.
+    objects: ObjectAccess,
 }
 
 /// An address could not be listened on.
@@ -82,9 +85,21 @@ impl Server {
             idle_timeout: settings.idle_timeout(),
             partial_frame_timeout: settings.partial_frame_timeout(),
             send_timeout: settings.send_timeout(),
+            objects: None,
         };
         let max_connections = usize::from(settings.max_connections);
-        Ok(Self { listeners, max_connections, shared: Arc::new(shared) })
+        Ok(Self { listeners, max_connections, shared, objects: settings.canopen_objects })
+    }
+
+    /// Asks for objects of nodes at this desk, as far as the settings allow it. Without a desk FC 43/13 is not offered.
+    #[must_use]
+    pub fn with_desk(mut self, desk: Desk) -> Self {
+        self.shared.objects = match self.objects {
+            ObjectAccess::Off => None,
+            ObjectAccess::Read => Some(Objects { desk, write: false }),
+            ObjectAccess::Write => Some(Objects { desk, write: true }),
+        };
+        self
     }
 
     /// The addresses that it listens on, in the order of the settings; port 0 has become a real one.
@@ -110,7 +125,7 @@ impl Server {
         let mut clients = Clients {
             slots: Slots::new(self.max_connections),
             tasks: JoinSet::new(),
-            shared: self.shared,
+            shared: Arc::new(self.shared),
             stop,
         };
         let mut second = tokio::time::interval(Duration::from_secs(1));
@@ -168,7 +183,7 @@ impl Clients {
         tracing::debug!(%peer, "Modbus connection opened");
         let (shared, stops) = (Arc::clone(&self.shared), Stops { evict, stop: self.stop.clone() });
         self.tasks.spawn(async move {
-            let end = connection::serve(stream, &shared, &taken.activity, &stops).await;
+            let end = connection::serve(stream, peer, &shared, &taken.activity, &stops).await;
             tracing::debug!(%peer, end = end.word(), "Modbus connection ended");
             (taken.id, end)
         });

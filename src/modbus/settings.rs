@@ -33,6 +33,22 @@ pub struct ModbusSettings {
     /// Close a connection that does not take an answer for this many milliseconds, at least 100.
     #[schemars(range(min = 100))]
     pub send_timeout_ms: u32,
+    /// FC 43/13, objects of the nodes by SDO: `off`, `read`, or `write` for both. Whoever reaches the port can then read, or
+    /// change, every object of every node.
+    pub canopen_objects: ObjectAccess,
+}
+
+/// What FC 43/13 may do.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum ObjectAccess {
+    /// Nothing: exception 01.
+    #[default]
+    Off,
+    /// Read objects; a write answers exception 03.
+    Read,
+    /// Read and write them.
+    Write,
 }
 
 /// Order of the two registers of a 32-bit value.
@@ -67,6 +83,7 @@ impl Default for ModbusSettings {
             idle_timeout_s: 0,
             partial_frame_timeout_ms: 10_000,
             send_timeout_ms: 5_000,
+            canopen_objects: ObjectAccess::Off,
         }
     }
 }
