@@ -24,6 +24,7 @@ mod scan;
 mod scan_report;
 pub mod schema;
 mod sdo;
+mod sdo_tag;
 mod session;
 pub mod sim;
 mod tool_args;

@@ -6,8 +6,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::Exit;
 use super::output::{block_on, print_error, print_line};
+use super::sdo_tag::{self, TagObject};
 use super::session::{Machine, Session, SessionError, Step, check_company};
-use super::tool_args::{SdoArguments, SdoCommand};
+use super::tool_args::{ObjectOrTag, SdoArguments, SdoCommand};
 use crate::can::CanFrame;
 use crate::can::interface::Interface;
 use crate::canopen::object::{DataType, ObjectId};
@@ -66,7 +67,11 @@ impl Machine for Transfer {
 
 /// Reads or writes, and prints what came of it.
 pub(super) fn run(arguments: &SdoArguments) -> Exit {
-    let request = match request(&arguments.action) {
+    let job = match Job::new(arguments) {
+        Ok(job) => job,
+        Err(exit) => return exit,
+    };
+    let request = match job.request(&arguments.action) {
         Ok(request) => request,
         Err(text) => {
             print_error(&text);
@@ -81,14 +86,14 @@ pub(super) fn run(arguments: &SdoArguments) -> Exit {
         };
         match done {
             Ok(Ok(bytes)) => {
-                if let Some(text) = told(&arguments.action, &bytes) {
+                if let Some(text) = job.told(&arguments.action, &bytes) {
                     print_line(&text);
                 }
                 Exit::Ok
             }
             Ok(Err(error)) => {
                 let node = arguments.node;
-                print_error(&format!("{} of node {node}: {error}", object(&arguments.action)));
+                print_error(&format!("{} of node {node}: {error}", job.object()));
                 if error == SdoError::BusUnavailable { Exit::Io } else { Exit::Refused }
             }
             Err(error) => {
@@ -109,29 +114,60 @@ fn settings(arguments: &SdoArguments) -> SdoSettings {
     }
 }
 
-fn object(action: &SdoCommand) -> ObjectId {
-    match action {
-        SdoCommand::Read { object, .. } | SdoCommand::Write { object, .. } => *object,
+/// What is to be transferred, as it was called.
+enum Job {
+    Object(ObjectId),
+    Tag(TagObject),
+}
+
+impl Job {
+    fn new(arguments: &SdoArguments) -> Result<Self, Exit> {
+        let (SdoCommand::Read { object, .. } | SdoCommand::Write { object, .. }) = &arguments.action;
+        match object {
+            ObjectOrTag::Object(object) => Ok(Self::Object(*object)),
+            ObjectOrTag::Tag(name) => sdo_tag::find(arguments, name).map(Self::Tag),
+        }
+    }
+
+    fn object(&self) -> ObjectId {
+        match self {
+            Self::Object(object) => *object,
+            Self::Tag(tag) => tag.object(),
+        }
+    }
+
+    fn request(&self, action: &SdoCommand) -> Result<SdoRequest, String> {
+        match self {
+            Self::Object(object) => request(action, *object),
+            Self::Tag(tag) => tag.request(action),
+        }
+    }
+
+    fn told(&self, action: &SdoCommand, bytes: &[u8]) -> Option<String> {
+        match self {
+            Self::Object(object) => told(action, *object, bytes),
+            Self::Tag(tag) => tag.told(action, bytes),
+        }
     }
 }
 
 /// What is asked of the client.
-fn request(action: &SdoCommand) -> Result<SdoRequest, String> {
+fn request(action: &SdoCommand, object: ObjectId) -> Result<SdoRequest, String> {
     match action {
-        SdoCommand::Read { object, data_type, .. } => {
-            let size = data_type.or_else(|| well_known::data_type(*object)).and_then(DataType::size);
-            let request = SdoRequest::read(*object);
+        SdoCommand::Read { data_type, .. } => {
+            let size = data_type.or_else(|| well_known::data_type(object)).and_then(DataType::size);
+            let request = SdoRequest::read(object);
             Ok(match size {
                 Some(size) => request.of_len(size),
                 None => request,
             })
         }
-        SdoCommand::Write { object, value, data_type } => {
-            let data_type = data_type.or_else(|| well_known::data_type(*object)).ok_or_else(|| {
+        SdoCommand::Write { value, data_type, .. } => {
+            let data_type = data_type.or_else(|| well_known::data_type(object)).ok_or_else(|| {
                 format!("the type of {object} is not known: say it, for example --type u16; the device's manual or EDS tells it")
             })?;
             let bytes = data_type.encode(value).map_err(|error| format!("{object}: {error}"))?;
-            Ok(SdoRequest::write(*object, bytes))
+            Ok(SdoRequest::write(object, bytes))
         }
     }
 }
@@ -156,15 +192,15 @@ async fn transfer(
 }
 
 /// What is printed after a success.
-fn told(action: &SdoCommand, bytes: &[u8]) -> Option<String> {
+fn told(action: &SdoCommand, object: ObjectId, bytes: &[u8]) -> Option<String> {
     match action {
         SdoCommand::Read { raw: true, .. } => DataType::OctetString.decode(bytes).ok(),
-        SdoCommand::Read { object, data_type, .. } => {
-            let data_type = data_type.or_else(|| well_known::data_type(*object));
-            let name = well_known::name(*object).map_or_else(String::new, |name| format!("  {name}"));
+        SdoCommand::Read { data_type, .. } => {
+            let data_type = data_type.or_else(|| well_known::data_type(object));
+            let name = well_known::name(object).map_or_else(String::new, |name| format!("  {name}"));
             Some(format!("{object} = {}{name}", readings(bytes, data_type)))
         }
-        SdoCommand::Write { object, value, .. } => Some(format!("{object} is written: {value}")),
+        SdoCommand::Write { value, .. } => Some(format!("{object} is written: {value}")),
     }
 }
 
@@ -206,6 +242,20 @@ mod tests {
     use crate::can::virtual_bus;
     use crate::can::{BusEvent, BusReader, BusWriter};
     use crate::canopen::sdo::AbortCode;
+
+    fn object(action: &SdoCommand) -> ObjectId {
+        let (SdoCommand::Read { object, .. } | SdoCommand::Write { object, .. }) = action;
+        let ObjectOrTag::Object(object) = object else { panic!("{object:?}") };
+        *object
+    }
+
+    fn request(action: &SdoCommand) -> Result<SdoRequest, String> {
+        super::request(action, object(action))
+    }
+
+    fn told(action: &SdoCommand, bytes: &[u8]) -> Option<String> {
+        super::told(action, object(action), bytes)
+    }
 
     fn read(object: &str, data_type: Option<DataType>) -> SdoCommand {
         SdoCommand::Read { object: object.parse().unwrap(), data_type, raw: false }

@@ -7,8 +7,9 @@ use std::str::FromStr;
 use clap::{Args, ValueEnum};
 
 use crate::can::interface::Interface;
-use crate::canopen::object::{DataType, ObjectId};
+use crate::canopen::object::{DataType, ObjectId, ParseObjectError};
 use crate::canopen::{NmtRequest, NodeId};
+use crate::mapping::build::is_snake_case;
 
 /// What a scan does, for `scan` and `init` alike.
 #[derive(Args, Clone, Copy, Debug)]
@@ -126,6 +127,12 @@ pub struct SdoArguments {
     /// Its CANopen node id, 1 to 127.
     #[arg(long, value_parser = node_id)]
     pub node: NodeId,
+    /// Call objects by the names of tags: those of this mapping, one that comes with the program or a file.
+    #[arg(long, value_name = "MAPPING", conflicts_with = "config")]
+    pub mapping: Option<String>,
+    /// The same: those of the node in this configuration that has this id.
+    #[arg(short, long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
     /// How long an answer may take, in ms.
     #[arg(long, default_value_t = 500, value_name = "MS", value_parser = clap::value_parser!(u32).range(10..=60_000))]
     pub timeout_ms: u32,
@@ -148,8 +155,8 @@ pub struct SdoArguments {
 pub enum SdoCommand {
     /// Read an object.
     Read {
-        /// Index and sub-index, for example 0x1018:1.
-        object: ObjectId,
+        /// Index and sub-index, for example 0x1018:1; or the name of a tag, with --mapping or --config.
+        object: ObjectOrTag,
         /// Its data type: bool, i8 to i64, u8 to u64, f32, f64, string, unicode, octets, domain, `time_of_day`,
         /// `time_difference`. Known for the objects that CiA 301 defines; without it all plausible readings are shown.
         #[arg(long = "type", value_name = "TYPE")]
@@ -160,15 +167,35 @@ pub enum SdoCommand {
     },
     /// Write an object, once.
     Write {
-        /// Index and sub-index, for example 0x1017:0.
-        object: ObjectId,
-        /// The value: 500, 0x1F4, 1.5, text; bytes as pairs of hexadecimal digits.
+        /// Index and sub-index, for example 0x1017:0; or the name of a tag, with --mapping or --config.
+        object: ObjectOrTag,
+        /// The value: 500, 0x1F4, 1.5, text; bytes as pairs of hexadecimal digits. Of a tag: in its unit.
         #[arg(allow_negative_numbers = true)]
         value: String,
         /// Its data type, as for `read`; needed where CiA 301 does not define the object.
         #[arg(long = "type", value_name = "TYPE")]
         data_type: Option<DataType>,
     },
+}
+
+/// How an object is called.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ObjectOrTag {
+    /// By index and sub-index.
+    Object(ObjectId),
+    /// By the name of the tag that it is.
+    Tag(String),
+}
+
+impl FromStr for ObjectOrTag {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        if is_snake_case(text) {
+            return Ok(Self::Tag(text.to_owned()));
+        }
+        text.parse().map(Self::Object).map_err(|error: ParseObjectError| error.to_string())
+    }
 }
 
 /// A node id.

@@ -179,6 +179,7 @@ fn parameter(
         device_unit: None,
         decimals: 0,
         source: Source::Derived(Derived::Constant { value: value.value }),
+        object: None,
         valid: None,
         doubtful: None,
         registers: Vec::new(),
@@ -226,7 +227,9 @@ fn from_pdo(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, sec
     let scaled = scale != Scale::IDENTITY || is_float || device_unit.is_some();
     let usual_decimals = if scaled { 2 } else { 0 };
     let tag = finished(problems, context, item, section.shared(), usual_decimals, source);
-    TagDef { device_unit, ..tag }
+    // One that cannot be read was told of with its place.
+    let object = section.object.as_ref().and_then(|object| object.value.parse().ok());
+    TagDef { device_unit, object, ..tag }
 }
 
 /// What the installation changes of the bits of a tag.
@@ -309,6 +312,7 @@ fn finished(
         device_unit: None,
         decimals: decimals.and_then(|decimals| u8::try_from(decimals).ok()).unwrap_or(usual_decimals),
         source,
+        object: None,
         valid: keys.valid.and_then(|valid| context.bool_tag(problems, valid, &item.element, "`valid`")),
         doubtful: keys.doubtful.and_then(|tag| context.bool_tag(problems, tag, &item.element, "`doubtful`")),
         registers: places(problems, context, item, keys),

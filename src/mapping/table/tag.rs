@@ -24,6 +24,8 @@ pub struct TagDef {
     pub decimals: u8,
     /// Where its value comes from.
     pub source: Source,
+    /// The object of the device that it is, where the mapping says so.
+    pub object: Option<ObjectId>,
     /// A bool tag of the same node that tells whether the value means anything (R-DET-086).
     pub valid: Option<TagIndex>,
     /// A bool tag of the same node that is true while the value is to be used with a reservation (R-DST-026).
