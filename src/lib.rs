@@ -9,7 +9,7 @@
 //! can/task ---BusEvent---> gateway/task ---- process image ---> modbus/server   (reads on demand)
 //! (owns socket)            (owns Gateway)    (one writer,  ---> mqtt/client     (changes + journal)
 //!    ^                           |            many readers)---> web/server      (snapshot, metrics)
-//!    |                           |                                          |
+//!    |                           |                              ---> cia309/server   (objects, by commands)
 //!    +------ frames to send -----+ <-------- Command + reply ---------------+
 //! ```
 //!
@@ -26,6 +26,7 @@
 //! | [`gateway`] | joins the above, pure but for its task | can, canopen, `process_image`, mapping, alarms, time |
 //! | [`slots`] | who must go when all places for connections are taken, pure | time |
 //! | [`modbus`], [`mqtt`], [`web`] | the process image as registers, topics, pages | `process_image`, mapping, `gateway::command`, slots, time |
+//! | [`cia309`] | the CANopen networks as lines of text (CiA 309-3) | as those, objects and their types of canopen |
 //! | [`simulator`] | pretend devices | can, canopen ids and NMT, time |
 //! | [`config`] | the installation's settings | each room's settings types |
 //! | [`supervisor`] | wires and watches the tasks | every room |
@@ -38,7 +39,7 @@
 //! 1. Only `time.rs` reads a clock.
 //! 2. Only files whose first line says \[IO\] touch sockets, files or tokio (and `process_image/handles.rs`, `time.rs`).
 //! 3. Only `gateway/task.rs` holds the [`process_image::ImageWriter`].
-//! 4. Views (modbus, mqtt, web) do not know each other.
+//! 4. Views (modbus, mqtt, web, cia309) do not know each other.
 //! 5. Every queue has a bound and says what happens when it is full.
 //! 6. No value without quality and time.
 //! 7. Nothing from a network can panic the process.
@@ -65,6 +66,7 @@
 pub mod alarms;
 pub mod can;
 pub mod canopen;
+pub mod cia309;
 pub mod cli;
 pub mod config;
 pub mod gateway;

@@ -31,11 +31,13 @@ const MAY_IMPORT: &[(&str, &[&str])] = &[
     ("modbus", &["process_image", "mapping", "gateway::command", "slots", "time"]),
     ("mqtt", &["process_image", "mapping", "gateway::command", "time"]),
     ("web", &["process_image", "mapping", "gateway::command", "slots", "time"]),
+    ("cia309", &["process_image", "mapping", "gateway::command", "canopen::object", "slots", "time"]),
     ("simulator", &["can", "canopen", "time"]),
     (
         "config",
         &[
             "can::interface",
+            "cia309::settings",
             "mapping",
             "modbus::settings",
             "mqtt::settings",

@@ -19,6 +19,7 @@
 //! | `mqtt_client` | the MQTT client against good, slow and hostile brokers |
 //! | `web_server` | health, metrics, page |
 //! | `lifecycle` | the program as a process: start, stop, exit codes |
+//! | `objects` | objects of nodes through the gateway: by CiA 309-3 and by FC 43/13, against the simulated transmitter |
 //! | `properties` | random input: no panic, no torn value |
 //! | `documents` | the documents against the program: alarms, keys, commands, names of tests |
 //! | `transmitter` | the gateway with the shipped mapping of the DST P92C against the simulated one |
@@ -62,6 +63,7 @@ mod modbus_server;
 mod mqtt_client;
 mod mqtt_publisher;
 mod neighbours;
+mod objects;
 mod outputs;
 mod properties;
 mod requirements;

@@ -63,5 +63,6 @@ fn to_installation(loaded: Loaded) -> Result<Installation, Exit> {
         modbus: settings.modbus,
         mqtt: settings.mqtt,
         http: settings.http,
+        cia309: settings.cia309,
     })
 }

@@ -9,6 +9,7 @@ use std::ffi::OsString;
 use serde::{Deserialize, Serialize};
 
 use super::settings::{GatewaySettings, Settings};
+use crate::cia309::settings::Cia309Settings;
 use crate::mapping::Diagnostic;
 use crate::mapping::suggest::closest;
 use crate::modbus::settings::ModbusSettings;
@@ -18,7 +19,7 @@ use crate::web::settings::WebSettings;
 /// With this begins the name of every variable that is meant for this program's settings.
 pub const PREFIX: &str = "CANGATE__";
 
-const SECTIONS: [&str; 4] = ["gateway", "modbus", "mqtt", "http"];
+const SECTIONS: [&str; 5] = ["gateway", "modbus", "mqtt", "http", "cia309"];
 
 /// The part of the settings that variables can change.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -28,6 +29,7 @@ struct Process {
     #[serde(skip_serializing_if = "Option::is_none")]
     mqtt: Option<MqttSettings>,
     http: WebSettings,
+    cia309: Cia309Settings,
 }
 
 /// What the environment did to the settings.
@@ -114,6 +116,7 @@ fn set(
         modbus: settings.modbus.clone(),
         mqtt: settings.mqtt.clone(),
         http: settings.http.clone(),
+        cia309: settings.cia309.clone(),
     };
     let place = format!("{section}.{key}");
     let list: Vec<&str> = value.split(',').map(str::trim).filter(|item| !item.is_empty()).collect();
@@ -127,6 +130,7 @@ fn set(
     settings.modbus = after.modbus;
     settings.mqtt = after.mqtt;
     settings.http = after.http;
+    settings.cia309 = after.cia309;
     Ok((section.to_owned(), key.to_owned()))
 }
 

@@ -69,6 +69,10 @@ pub fn load(
                 let hint = "add a [node.NAME] with `bus`, `id` and `mapping`";
                 warnings.push(source.warning(&(0..0), "there is no node, so there is nothing to show", hint));
             }
+            if let Some(message) = settings.cia309.warning() {
+                let place = locate(source, &["cia309", "listen"]);
+                warnings.push(source.warning(&place, message, "without `writes` nothing can be changed"));
+            }
             Ok(Loaded { settings, interfaces, table, warnings })
         }
         Ok((_, more)) | Err(more) => {
@@ -98,6 +102,9 @@ fn check(source: &SourceText, settings: &Settings, overlay: &Overlay) -> Vec<Dia
     }
     for (key, message, hint) in settings.mqtt.iter().flat_map(MqttSettings::problems) {
         tell("mqtt", key, message.to_string(), hint.to_string());
+    }
+    for (key, message, hint) in settings.cia309.problems() {
+        tell("cia309", key, message, hint);
     }
     for name in settings.node.keys().filter(|name| RESERVED_NODE_NAMES.contains(&name.value.as_str())) {
         let message = format!("`{}` cannot be the name of a node", name.value);

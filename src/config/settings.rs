@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::cia309::settings::Cia309Settings;
 use crate::mapping::At;
 use crate::mapping::installation::{BusEntry, NodeEntry};
 use crate::modbus::settings::ModbusSettings;
@@ -35,6 +36,9 @@ pub struct Settings {
     /// The page, health and metrics.
     #[serde(default)]
     pub http: WebSettings,
+    /// The CiA 309-3 gateway; off unless it has a `listen`.
+    #[serde(default)]
+    pub cia309: Cia309Settings,
 }
 
 /// The `[gateway]` table.

@@ -121,7 +121,17 @@ impl Gateway {
     pub(super) fn finish_write(&mut self, at: Now, asked: Asked, outcome: Outcome) {
         let Asked { id, source, node, what, .. } = asked;
         let about = self.owner_of_node(node);
-        self.finished.push(Finished { id, at, source, name: "sdo_write", about, what, outcome, frame: None, undo: None });
+        self.finished.push(Finished {
+            id,
+            at,
+            source,
+            name: "sdo_write",
+            about,
+            what,
+            outcome,
+            frame: None,
+            undo: None,
+        });
     }
 
     /// `frame` becomes the one that carries the command.

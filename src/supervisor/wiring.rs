@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::info;
 
@@ -13,7 +13,8 @@ use super::{descriptors, health, readings};
 use crate::can::interface::Interface;
 use crate::can::{self, BusIndex};
 use crate::canopen::Role;
-use crate::gateway::{self, Gateway, Health};
+use crate::cia309::{self, Cia309Settings};
+use crate::gateway::{self, Command, Desk, Gateway, Health, Outcome};
 use crate::mapping::TagTable;
 use crate::modbus::gateway_block::MAP_VERSION;
 use crate::modbus::{self, MapFormat, ModbusSettings, RegisterBank, RegisterMap, map_text};
@@ -45,6 +46,8 @@ pub struct Installation {
     pub mqtt: Option<MqttSettings>,
     /// HTTP.
     pub http: WebSettings,
+    /// CiA 309-3.
+    pub cia309: Cia309Settings,
 }
 
 /// Why the gateway could not start: something outside is not as it has to be.
@@ -56,6 +59,9 @@ pub enum StartError {
     /// The HTTP listener.
     #[error(transparent)]
     Web(#[from] WebError),
+    /// The CiA 309-3 listener.
+    #[error(transparent)]
+    Cia309(#[from] cia309::BindError),
 }
 
 /// A gateway whose listeners are bound, but of which nothing runs yet.
@@ -67,6 +73,8 @@ pub struct Bound {
     reader: ImageReader,
     modbus: modbus::Server,
     web: web::Server,
+    cia309: Option<cia309::Server>,
+    commands: mpsc::Receiver<(Command, oneshot::Sender<Outcome>)>,
     mqtt_status: watch::Sender<MqttStatus>,
     identity: Identity,
     /// Set once every task is spawned: then `/readyz` says so.
@@ -101,7 +109,9 @@ pub async fn bind(installation: Installation, clock: Clock) -> Result<Bound, Sta
     }
     let (writer, reader) = process_image(gateway.empty_image());
     let bank = RegisterBank::new(Arc::clone(table), Arc::clone(map));
-    let modbus = modbus::Server::bind(modbus, bank, reader.clone(), clock).await?;
+    let (desk, commands) = Desk::new(COMMANDS);
+    let modbus = modbus::Server::bind(modbus, bank, reader.clone(), clock).await?.with_desk(desk.clone());
+    let cia309 = bind_cia309(&installation, desk, clock).await?;
     let (mqtt_status, mqtt_seen) = watch::channel(MqttStatus::default());
     let identity = identity(map, clock);
     let counters = modbus.counters();
@@ -128,7 +138,37 @@ pub async fn bind(installation: Installation, clock: Clock) -> Result<Bound, Sta
         map_csv: map_text::render(map, MapFormat::Csv).into(),
     };
     let web = web::Server::bind(http, state).await?;
-    Ok(Bound { installation, gateway, writer, reader, modbus, web, mqtt_status, identity, ready, clock })
+    Ok(Bound {
+        installation,
+        gateway,
+        writer,
+        reader,
+        modbus,
+        web,
+        cia309,
+        commands,
+        mqtt_status,
+        identity,
+        ready,
+        clock,
+    })
+}
+
+async fn bind_cia309(
+    installation: &Installation,
+    desk: Desk,
+    clock: Clock,
+) -> Result<Option<cia309::Server>, StartError> {
+    let settings = &installation.cia309;
+    let Some(address) = settings.listen else { return Ok(None) };
+    let shared = cia309::connection::Shared {
+        table: Arc::clone(&installation.table),
+        desk,
+        writes: settings.writes,
+        clock,
+        idle_timeout: settings.idle_timeout(),
+    };
+    Ok(Some(cia309::Server::bind(address, settings.max_connections, shared).await?))
 }
 
 impl Bound {
@@ -166,8 +206,6 @@ impl Bound {
             tasks.spawn(format!("bus {interface}"), bus);
         }
         drop(events);
-        // Northbounds that may ask for something get a clone of `_commands`; none of them may yet.
-        let (_commands, command_queue) = mpsc::channel(COMMANDS);
         let (health, health_seen) = watch::channel(Health::default());
         tasks.spawn(
             "gateway",
@@ -176,7 +214,7 @@ impl Bound {
                 self.writer,
                 event_queue,
                 transmit,
-                command_queue,
+                self.commands,
                 health_seen,
                 self.clock,
                 stop.clone(),
@@ -184,6 +222,9 @@ impl Bound {
         );
         tasks.spawn("modbus", self.modbus.run(stop.clone()));
         tasks.spawn("web", self.web.run(stop.clone()));
+        if let Some(server) = self.cia309 {
+            tasks.spawn("cia309", server.run(stop.clone()));
+        }
         let session = self.installation.mqtt.is_some().then(|| self.mqtt_status.subscribe());
         tasks.spawn("health", health::run(session, health, stop.clone()));
         if let Some(settings) = self.installation.mqtt {
@@ -211,6 +252,9 @@ impl Bound {
             info!(%address, "Modbus TCP");
         }
         info!("page http://{}/", self.web.local_addr());
+        if let Some(server) = &self.cia309 {
+            info!(address = %server.local_addr(), writes = self.installation.cia309.writes, "CiA 309-3");
+        }
         for (bus, interface) in table.buses.iter().zip(&self.installation.interfaces) {
             info!(bus = bus.name, %interface, role = ?bus.role, "CAN bus");
         }
