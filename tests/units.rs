@@ -141,7 +141,7 @@ fn v_dst_01_to_05_pressures_in_pa_bar_and_mbar() {
 }
 
 #[test]
-fn v_dst_06_digits_do_not_apply_to_the_float() {
+fn v_dst_06_r_dst_031_032_digits_do_not_apply_to_the_float_but_the_unit_does() {
     let text = mapping(r#""0x6130:1/32", "0x9130:2/32""#, (BAR, 3), (CELSIUS, 0));
     let heard = Heard::new("181#0000C03F19000000", &text);
     heard.assert("pressure", 1.5);
