@@ -370,7 +370,7 @@ fn mistakes_about_sync_and_time_are_told() {
         ("time = { period_s = 1, cob_id = 0x581 }", "581 is kept for"),
         (
             "sync = { period_ms = 10, cob_id = 0x181 }\n[node.a]\nbus = \"can0\"\nid = 1\nmapping = \"danfoss-dst-p92c\"",
-            "SYNC of bus `can0` and TPDO 1 of node `a` have the same identifier 181",
+            "SYNC of bus `can0` (line 4) and TPDO 1 of node `a` have the same identifier 181",
         ),
     ] {
         let told = config(lines);
