@@ -305,7 +305,6 @@ fn somebody_elses_sdo_requests_are_told_reads_once_and_writes_with_their_object(
             "120 ForeignSdo { object: ObjectId { index: 4119, sub: 0 }, write: true }",
             "130 ForeignSdo { object: ObjectId { index: 12288, sub: 0 }, write: true }",
             "140 ForeignSdo { object: ObjectId { index: 4120, sub: 1 }, write: true }",
-            "160 ForeignSdo { object: ObjectId { index: 0, sub: 0 }, write: false }",
         ]
     );
 }
