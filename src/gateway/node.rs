@@ -263,10 +263,8 @@ impl Node {
         if !stale.is_empty() {
             return format!("does not come: {}", stale.join(", "));
         }
-        match self.duplicate {
-            Some(evidence) => format!("two devices seem to share node id {id}: {evidence}"),
-            None => String::new(),
-        }
+        let shared = |evidence| format!("two devices seem to share node id {id}: {evidence}");
+        self.duplicate.map_or_else(String::new, shared)
     }
 }
 
