@@ -102,7 +102,10 @@ fn r_dst_024_tags_are_decoded_where_the_device_maps_their_objects() {
     assert!(world.tag(2, "hot").value.is_true(), "what is computed from it is computed");
     assert_eq!(world.tag(2, "pressure_float").quality, Quality::Bad(Reason::NotMapped));
     assert_eq!(text_of(&world, "not_mapped"), "no TPDO of the device carries: pressure_float");
-    assert_eq!(text_of(&world, "pdo_adopted"), "the device sends in TPDO1: 0x9130:1/32, 0x6150:1/8");
+    assert_eq!(
+        text_of(&world, "pdo_adopted"),
+        "the device sends in TPDO1: 0x9130:1 (32 bit), 0x6150:1 (8 bit)"
+    );
     let writes = world.sent.iter().filter(|frame| frame.starts_with("602#2")).collect::<Vec<_>>();
     assert_eq!(writes, ["602#2B171000F4010000"], "nothing but the heartbeat");
     assert!(world.raised.is_empty(), "{:?}", world.raised);

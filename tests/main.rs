@@ -49,6 +49,7 @@
 mod adopt;
 mod architecture;
 mod clashes;
+mod commissioned;
 mod contract;
 mod contract_mqtt;
 mod conversations;

@@ -155,6 +155,14 @@ start_retry_ms = 2000
 reset_on_recovery = true
 pdo_timeout_ms = 900
 strict_dlc = true
+required = false
+configure = true
+check_identity = false
+heartbeat_ms = 1000
+self_starting = false
+save_after_config = false
+store_timeout_ms = 5000
+sdo_timeout_ms = 200
 
 [node.engine1.parameters]
 expected_used_sensors_1_16 = 0x0FFF

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::Gateway;
-use super::node::BootTrouble;
+use super::node::{BootTrouble, Node};
 use super::tags::CarrierIndex;
 use super::units::{Finding, What};
 use crate::can::CanId;
@@ -36,13 +36,20 @@ impl Gateway {
             }
             BootEvent::Errors { register, code } => self.errors_read(at, *register, *code),
             BootEvent::Begun => self.withhold(at.1),
+            BootEvent::OtherDevice(difference) => {
+                self.change(at.1, |node| {
+                    node.other_device = true;
+                    node.status.identity_mismatch = true;
+                });
+                self.tell(at, "identity_mismatch", |event| event.text = difference.to_string());
+            }
             BootEvent::Mapped(mapped) => self.mapped(at, mapped),
             BootEvent::RpdoMapped(mapped) => self.rpdo_mapped(at, mapped),
             BootEvent::Done { written } => {
                 self.tell_of_missing(at);
                 self.change(at.1, |node| {
                     node.boot_trouble = None;
-                    node.status.identity_mismatch = false;
+                    node.status.identity_mismatch = node.other_device;
                 });
                 self.tell(at, "node_configured", |event| {
                     event.text = format!("{written} object(s) had to be written");
@@ -56,6 +63,7 @@ impl Gateway {
     /// (R-DST-034).
     fn withhold(&mut self, index: NodeIndex) {
         self.tags.units().forget(index);
+        self.change(index, |node| node.other_device = false);
         let (Some(def), Some(node)) = (self.table.nodes.get(index.0), self.nodes.get_mut(index.0)) else {
             return;
         };
@@ -183,7 +191,8 @@ impl Gateway {
         let table = Arc::clone(&self.table);
         for (place, def) in table.nodes.iter().enumerate() {
             let index = NodeIndex(place);
-            let passive = table.buses.get(def.bus.0).is_none_or(|bus| bus.role == Role::Passive);
+            let passive = table.buses.get(def.bus.0).is_none_or(|bus| bus.role == Role::Passive)
+                || def.canopen.sdo.is_none();
             for pdo in (0..def.canopen.pdos.len()).map(PdoIndex).filter(|_| passive) {
                 if let (Some(_), Some(setup)) = (def.canopen.boot.adopts(pdo), def.canopen.boot.setup_of(pdo))
                 {
@@ -246,7 +255,10 @@ impl Gateway {
             node.status.identity_mismatch = matches!(trouble, BootTrouble::OtherDevice(_));
             node.boot_trouble = Some(trouble);
         });
-        self.tell(at, "node_boot_failed", |event| event.text = failure.to_string());
+        let absent = |(node, def): (&Node, _)| node.may_be_absent(def);
+        if !self.nodes.get(at.1.0).zip(self.table.nodes.get(at.1.0)).is_some_and(absent) {
+            self.tell(at, "node_boot_failed", |event| event.text = failure.to_string());
+        }
     }
 }
 

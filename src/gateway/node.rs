@@ -25,6 +25,8 @@ pub(super) struct Node {
     /// It restarts again and again, so that its start waits.
     pub(super) start_held_back: bool,
     pub(super) stop_ordered: bool,
+    /// It was found to be another device in the boot under way, and that is tolerated.
+    pub(super) other_device: bool,
     /// Why its boot failed last.
     pub(super) boot_trouble: Option<BootTrouble>,
     /// A frame came at any time since the gateway started.
@@ -101,7 +103,9 @@ impl Node {
             pdos: pdos.iter().map(|pdo| PdoStatus { number: pdo.number, ..PdoStatus::default() }).collect(),
             ..NodeStatus::default()
         };
-        let asked = |place: usize| !passive && def.canopen.boot.asks_about(PdoIndex(place));
+        let asked = |place: usize| {
+            !passive && def.canopen.sdo.is_some() && def.canopen.boot.asks_about(PdoIndex(place))
+        };
         Self {
             status,
             nmt: None,
@@ -111,6 +115,7 @@ impl Node {
             start_failed: None,
             start_held_back: false,
             stop_ordered: false,
+            other_device: false,
             boot_trouble: None,
             ever_seen: false,
             told_lost: false,
@@ -171,9 +176,17 @@ impl Node {
         }
     }
 
+    /// It is optional, and has not come since the gateway started.
+    pub(super) fn may_be_absent(&self, def: &NodeDef) -> bool {
+        !def.required && !self.ever_seen
+    }
+
     /// Whether frames are to be expected of it all the time.
     pub(super) fn is_expected(&self, def: &NodeDef) -> bool {
         let sends_pdos = self.watches.iter().any(|pdo| pdo.timeout.is_some());
+        if self.may_be_absent(def) {
+            return false;
+        }
         let may_send = matches!(self.nmt, None | Some(NmtState::Operational));
         is_watched(def) || (sends_pdos && may_send)
     }
@@ -289,11 +302,12 @@ impl Gateway {
         status.nmt = node.nmt.filter(|_| status.online);
         status.supervised = status.online && node.supervised;
         node.status.reason = node.reason(def, bus_trouble.as_deref());
+        node.status.may_be_absent = node.may_be_absent(def);
         self.dirty_nodes.mark(index.0);
 
         let owner = AlarmOwner::Node(index);
         // A node that never was there was not lost: that has an alarm of its own, which names other causes.
-        let (lost, never_seen) = (node.lost.is_some() && node.ever_seen, node.never_seen);
+        let (lost, never_seen) = (node.lost.is_some() && node.ever_seen, node.never_seen && def.required);
         let boot_failed = node.contact && node.boot_trouble.is_some();
         let other_device = node.contact && matches!(node.boot_trouble, Some(BootTrouble::OtherDevice(_)));
         let start_failed = node.start_failed.is_some() || node.start_held_back || boot_failed;

@@ -91,7 +91,7 @@ fn candidate(sighting: &Sighting, name: &str, text: &str) -> Option<Candidate> {
 /// Whether the node is by its identity the device that a mapping is for; `None`: that cannot be said.
 fn identity(read: &BTreeMap<ObjectId, u32>, settings: &NodeSettings) -> Option<bool> {
     let expected = settings.boot.steps.iter().filter_map(|step| {
-        if let BootStep::Identity { object, expected } = step { Some((*object, *expected)) } else { None }
+        if let BootStep::Identity { object, expected, .. } = step { Some((*object, *expected)) } else { None }
     });
     let expected: Vec<(ObjectId, u32)> = expected.collect();
     if expected.iter().any(|(object, value)| read.get(object).is_some_and(|told| told != value)) {

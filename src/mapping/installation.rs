@@ -160,6 +160,22 @@ pub struct NodeEntry {
     pub start_retry_ms: Option<At<u64>>,
     /// Send reset node when a lost node comes back (R-DET-016).
     pub reset_on_recovery: Option<bool>,
+    /// The node has to be there: one that never came is an alarm. Default: true.
+    pub required: Option<bool>,
+    /// Read and write its objects by SDO. Default: true; off: it is started and listened to, and nothing more (R-DST-122).
+    pub configure: Option<bool>,
+    /// Do not start a node that is another device than the mapping is for (R-DST-001). Default: true.
+    pub check_identity: Option<bool>,
+    /// Heartbeat that the node is to send, 10..=65535 ms (R-DST-061).
+    pub heartbeat_ms: Option<At<u64>>,
+    /// The node starts by itself (R-DST-059).
+    pub self_starting: Option<bool>,
+    /// Store the parameters in the node after something was written (R-DST-090).
+    pub save_after_config: Option<bool>,
+    /// How long the answer to a store may take, 100..=60000 ms (R-DST-073).
+    pub store_timeout_ms: Option<At<u64>>,
+    /// How long any other SDO answer may take, 10..=60000 ms (R-DST-073).
+    pub sdo_timeout_ms: Option<At<u64>>,
     /// For every TPDO of the node: stale after this long, 10..=3600000 ms; 0 = not supervised (R-DET-082).
     pub pdo_timeout_ms: Option<At<u64>>,
     /// For every TPDO of the node: discard frames that are too long (R-DET-081).

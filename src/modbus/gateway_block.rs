@@ -228,6 +228,7 @@ impl GatewayView<'_> {
         (0..self.table.nodes.len()).all(|index| {
             NodeView::new(self.table, self.image, NodeIndex(index), self.now)
                 .is_some_and(|node| node.is_healthy())
+                || self.image.node(NodeIndex(index)).is_some_and(|node| node.may_be_absent)
         })
     }
 

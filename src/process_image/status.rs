@@ -16,6 +16,8 @@ pub struct NodeStatus {
     pub supervised: bool,
     /// Device type or identity is not the configured one.
     pub identity_mismatch: bool,
+    /// It need not be there, and has not come since the gateway started.
+    pub may_be_absent: bool,
     /// Sends data that a simulator made up.
     pub simulated: bool,
     /// The gateway sends nothing to this node's bus.

@@ -38,6 +38,8 @@ pub enum BootEvent {
         /// Why.
         error: SdoError,
     },
+    /// It is another device than the mapping file is for, and that is tolerated.
+    OtherDevice(BootFailure),
     /// A TPDO is otherwise than the mapping file says, and stays so.
     Deviation {
         /// Which.

@@ -25,7 +25,7 @@ pub use settings::{BootSettings, BootStep, MappingMode, PdoSetup};
 
 use self::task::{Advance, Task};
 use super::object::MappedObject;
-use super::sdo::{SdoError, SdoRequest, TransferId};
+use super::sdo::{SdoAction, SdoError, SdoRequest, TransferId};
 use super::{PdoIndex, RpdoIndex};
 use crate::time::Instant;
 
@@ -52,6 +52,8 @@ pub(super) struct Boot {
     told: Option<BootFailure>,
     /// The node is not known to be pre-operational.
     may_run: bool,
+    /// A write that waits for the node to be pre-operational.
+    held: Option<SdoRequest>,
     outputs: VecDeque<BootOutput>,
 }
 
@@ -94,6 +96,7 @@ impl Boot {
             failures: 0,
             told: None,
             may_run: true,
+            held: None,
             outputs: VecDeque::new(),
         }
     }
@@ -161,12 +164,18 @@ impl Boot {
         self.may_run = may_run;
     }
 
+    /// Whether the node starts by itself.
+    pub(super) fn is_self_starting(&self) -> bool {
+        self.settings.self_starting
+    }
+
     /// The bus cannot be used.
     pub(super) fn pause(&mut self) {
         if !self.is_empty() {
             self.phase = Phase::Paused;
             self.task = None;
             self.may_run = true;
+            self.held = None;
         }
     }
 
@@ -212,7 +221,10 @@ impl Boot {
             Phase::Settling(at) if at <= now => {
                 self.may_run = false;
                 self.phase = Phase::Running;
-                self.advance(now, None);
+                match self.held.take() {
+                    Some(request) => self.outputs.push_back(BootOutput::Sdo(self.transfer(), request)),
+                    None => self.advance(now, None),
+                }
             }
             Phase::Paused | Phase::Waiting(_) | Phase::Running | Phase::Settling(_) | Phase::Done => {}
         }
@@ -240,6 +252,7 @@ impl Boot {
         if !self.is_empty() {
             self.phase = Phase::Waiting(at);
             self.task = None;
+            self.held = None;
             self.outputs.push_back(BootOutput::Tell(BootEvent::Begun));
         }
     }
@@ -263,8 +276,13 @@ impl Boot {
             let Some(task) = &mut self.task else { return };
             match task.advance(answer.take(), self.may_run) {
                 Advance::Ask(request) => {
-                    let id = self.transfer();
-                    self.outputs.push_back(BootOutput::Sdo(id, request.for_boot()));
+                    let writes = matches!(request.action, SdoAction::Write(_));
+                    let request = request.for_boot();
+                    if writes && self.may_run && self.settings.self_starting {
+                        self.held = Some(request);
+                        return self.enter_pre_operational(now);
+                    }
+                    self.outputs.push_back(BootOutput::Sdo(self.transfer(), request));
                     return;
                 }
                 Advance::Tell(event) => self.outputs.push_back(BootOutput::Tell(event)),
@@ -272,11 +290,7 @@ impl Boot {
                     self.written = self.written.saturating_add(1);
                     self.outputs.push_back(BootOutput::Tell(BootEvent::Wrote { object }));
                 }
-                Advance::EnterPreOperational => {
-                    self.outputs.push_back(BootOutput::EnterPreOperational);
-                    self.phase = Phase::Settling(now + SETTLE);
-                    return;
-                }
+                Advance::EnterPreOperational => return self.enter_pre_operational(now),
                 Advance::Done => {
                     self.task = None;
                     self.step += 1;
@@ -285,6 +299,11 @@ impl Boot {
                 Advance::Failed(failure) => return self.fail(now, failure),
             }
         }
+    }
+
+    fn enter_pre_operational(&mut self, now: Instant) {
+        self.outputs.push_back(BootOutput::EnterPreOperational);
+        self.phase = Phase::Settling(now + SETTLE);
     }
 
     /// Told once for each cause; tried again, ever more seldom.

@@ -14,6 +14,9 @@ pub struct BootSettings {
     pub retry: Duration,
     /// But never more seldom than this.
     pub longest_retry: Duration,
+    /// The node starts by itself (0x1F80, R-DST-059): it is put into pre-operational before anything is written, and started
+    /// when that is done.
+    pub self_starting: bool,
 }
 
 impl BootSettings {
@@ -71,7 +74,12 @@ impl BootSettings {
 
 impl Default for BootSettings {
     fn default() -> Self {
-        Self { steps: Vec::new(), retry: Duration::from_secs(1), longest_retry: Duration::from_secs(30) }
+        Self {
+            steps: Vec::new(),
+            retry: Duration::from_secs(1),
+            longest_retry: Duration::from_secs(30),
+            self_starting: false,
+        }
     }
 }
 
@@ -84,6 +92,8 @@ pub enum BootStep {
         object: ObjectId,
         /// Its value.
         expected: u32,
+        /// Another device is told, and booted all the same (`check_identity = false`).
+        tolerated: bool,
     },
     /// Reads an object and tells its value. That the node does not have it is told too, and no failure.
     Read {

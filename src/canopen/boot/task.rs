@@ -51,7 +51,7 @@ impl Advance {
 /// A step under way.
 #[derive(Debug)]
 pub(super) enum Task {
-    Identity { object: ObjectId, expected: u32 },
+    Identity { object: ObjectId, expected: u32, tolerated: bool, told: bool },
     Read { object: ObjectId, told: bool },
     Write(Write),
     Errors(Errors),
@@ -94,8 +94,8 @@ impl Task {
     /// `written`: objects that the steps before wrote.
     pub(super) fn new(step: &BootStep, written: u32) -> Self {
         match step {
-            BootStep::Identity { object, expected } => {
-                Self::Identity { object: *object, expected: *expected }
+            BootStep::Identity { object, expected, tolerated } => {
+                Self::Identity { object: *object, expected: *expected, tolerated: *tolerated, told: false }
             }
             BootStep::Read { object } => Self::Read { object: *object, told: false },
             BootStep::Write { object, data, optional } => Self::Write(Write {
@@ -114,7 +114,16 @@ impl Task {
     /// Goes on.
     pub(super) fn advance(&mut self, answer: Answer, may_run: bool) -> Advance {
         match self {
-            Self::Identity { object, expected } => identity(*object, *expected, answer),
+            Self::Identity { told: true, .. } => Advance::Done,
+            Self::Identity { object, expected, tolerated, told } => {
+                match identity(*object, *expected, answer) {
+                    Advance::Failed(other @ BootFailure::Identity { .. }) if *tolerated => {
+                        *told = true;
+                        Advance::Tell(BootEvent::OtherDevice(other))
+                    }
+                    other => other,
+                }
+            }
             Self::Read { object, told } => read(*object, told, answer),
             Self::Write(write) => write.advance(answer),
             Self::Errors(errors) => errors.advance(answer),

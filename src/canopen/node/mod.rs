@@ -59,6 +59,8 @@ pub(super) struct Node {
     pub(super) ordered: Option<NmtState>,
     /// What `ordered` was before the last command of ours, and whether the node was held.
     before: Option<(Option<NmtState>, bool)>,
+    /// It was taken out of operation to be configured, and starts by nobody's command: that is given back.
+    taken_out: bool,
     /// Until then a boot-up message is the effect of an ordered reset.
     pub(super) reset_until: Option<Instant>,
     /// Undefined state code that was told last.
@@ -122,6 +124,7 @@ impl Node {
             state: None,
             ordered: None,
             before: None,
+            taken_out: false,
             reset_until: None,
             invalid: None,
             unsolicited_told: false,

@@ -238,7 +238,7 @@ impl Node {
     fn set_state(&mut self, to: NmtState, ordered: bool, outputs: &mut Outputs) {
         let from = self.state.replace(to);
         self.boot.handle_state(match to {
-            NmtState::Initialising => self.self_starting,
+            NmtState::Initialising => self.self_starting || self.boot.is_self_starting(),
             NmtState::PreOperational => false,
             NmtState::Operational | NmtState::Stopped => true,
         });

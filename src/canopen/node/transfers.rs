@@ -146,6 +146,7 @@ impl Node {
                 outputs.node(self.id, NodeEvent::Boot(event));
                 if done {
                     self.polls.begin(now);
+                    self.give_back(now, outputs);
                 }
                 if let Some(start) = self.start.as_mut().filter(|_| done) {
                     // A node that runs already will say so within the time of a heartbeat, and is not started for nothing.
@@ -156,6 +157,16 @@ impl Node {
                     start.handle_boot_done(now, self.state == Some(NmtState::Operational), wait);
                 }
             }
+        }
+    }
+
+    /// A node that nobody starts, and that was taken out of operation, is operational again (R-DST-059).
+    fn give_back(&mut self, now: Instant, outputs: &mut Outputs) {
+        let held = self.start.as_ref().is_some_and(Start::is_held);
+        if std::mem::take(&mut self.taken_out) && self.self_starting && !held {
+            let request = NmtRequest::Start;
+            outputs.transmit(request.frame(Some(self.id)));
+            self.command_sent(now, request, false, outputs);
         }
     }
 
@@ -175,6 +186,7 @@ impl Node {
     /// So that its configuration can be changed; it is started when that is done.
     fn enter_pre_operational(&mut self, now: Instant, outputs: &mut Outputs) {
         let request = NmtRequest::EnterPreOperational;
+        self.taken_out |= self.state == Some(NmtState::Operational) || self.boot.is_self_starting();
         outputs.transmit(request.frame(Some(self.id)));
         self.note_sent(now, request, outputs);
         self.state = Some(NmtState::PreOperational);

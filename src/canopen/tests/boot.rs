@@ -121,8 +121,8 @@ fn setup(mode: MappingMode, set_invalid: bool) -> PdoSetup {
 
 fn steps() -> Vec<BootStep> {
     vec![
-        BootStep::Identity { object: object(0x1000, 0), expected: 0x0002_0194 },
-        BootStep::Identity { object: object(0x1018, 1), expected: 0x23D },
+        BootStep::Identity { object: object(0x1000, 0), expected: 0x0002_0194, tolerated: false },
+        BootStep::Identity { object: object(0x1018, 1), expected: 0x23D, tolerated: false },
         BootStep::Write { object: object(0x1017, 0), data: 500_u16.to_le_bytes().to_vec(), optional: false },
         BootStep::Pdo(setup(MappingMode::Write, false)),
         BootStep::Read { object: object(0x6131, 1) },

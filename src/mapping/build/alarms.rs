@@ -11,6 +11,7 @@ use super::super::{At, SourceText};
 use super::derived::condition;
 use super::emergency;
 use super::items::{Element, elements, refuse_stride};
+use super::node::Tpdo;
 use super::order::causes_first;
 use super::problems::{Problems, is_snake_case, matched};
 use super::tags::Context;
@@ -147,7 +148,9 @@ fn built_in(
         let one = [(builtin.name.to_owned(), builtin.text.to_owned(), builtin.condition, asked)];
         let each = pdos.iter().enumerate().map(|(place, pdo)| {
             let fill = |text: &str| text.replace("{}", &pdo.number.to_string());
-            (fill(builtin.name), fill(builtin.text), BuiltIn::PdoTimeout(place), pdo.timeout.is_some())
+            // Whether one that is adopted is supervised is for the device to say.
+            let supervised = pdo.timeout.is_some() || context.tpdos.get(place).is_some_and(Tpdo::is_adopted);
+            (fill(builtin.name), fill(builtin.text), BuiltIn::PdoTimeout(place), supervised)
         });
         let variants: Vec<_> =
             if builtin.name.contains("{}") { each.collect() } else { one.into_iter().collect() };

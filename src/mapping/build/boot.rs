@@ -30,8 +30,8 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
     if context.file.emergency.read_at_boot {
         steps.push(BootStep::Errors);
     }
-    if let Some(at) = &context.file.error_control.heartbeat_ms {
-        let millis = problems.within(context.source, at, "heartbeat_ms", 10..=65_535);
+    if let Some((source, at)) = node::heartbeat(context) {
+        let millis = problems.within(source, at, "heartbeat_ms", 10..=65_535);
         let data = u16::try_from(millis).unwrap_or(u16::MAX).to_le_bytes().to_vec();
         steps.push(BootStep::Write { object: HEARTBEAT, data, optional: false });
     }
@@ -78,6 +78,10 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
         steps.insert(before_pdos, BootStep::Read { object: EMERGENCY_ID });
     }
     steps.extend(rpdo::steps(context));
+    let start = &context.file.start;
+    if context.entry.save_after_config.or(start.save_after_config).unwrap_or(false) && !steps.is_empty() {
+        steps.push(BootStep::Save);
+    }
     steps
 }
 
@@ -107,6 +111,7 @@ fn refuse_changes(problems: &mut Problems, context: &Context<'_>, tpdo: &Tpdo<'_
 
 fn identity(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
     let Some(identity) = &context.file.identity else { return Vec::new() };
+    let tolerated = context.entry.check_identity == Some(false);
     let keys = [
         (&identity.device_type, ObjectId::new(0x1000, 0), "device_type"),
         (&identity.vendor_id, ObjectId::new(0x1018, 1), "vendor_id"),
@@ -115,7 +120,7 @@ fn identity(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
     ];
     let steps = keys.into_iter().filter_map(|(at, object, what)| {
         let expected = problems.within(context.source, at.as_ref()?, what, 0..=u64::from(u32::MAX));
-        Some(BootStep::Identity { object, expected: u32::try_from(expected).ok()? })
+        Some(BootStep::Identity { object, expected: u32::try_from(expected).ok()?, tolerated })
     });
     steps.collect()
 }

@@ -290,6 +290,7 @@ impl Builder<'_> {
             },
             unit_id: u8::try_from(unit_id).unwrap_or(1),
             offset: entry.offset.as_ref().and_then(|offset| u16::try_from(offset.value).ok()).unwrap_or(0),
+            required: entry.required.unwrap_or(true),
             on_loss: entry.on_loss.into(),
             zero_on_bad: entry.zero_on_bad,
             tags: context.base..context.base + tags.len(),

@@ -43,13 +43,43 @@ pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> N
         pdos: pdos.collect(),
         error_control,
         start: start(problems, context),
-        sdo: (!steps.is_empty() || !polls.is_empty()).then(SdoSettings::default),
-        boot: BootSettings { steps, ..BootSettings::default() },
+        // Without SDO none of the steps is done, but what they would see to is believed.
+        sdo: ((!steps.is_empty() || !polls.is_empty()) && context.entry.configure != Some(false))
+            .then(|| sdo(problems, context)),
+        boot: BootSettings { steps, self_starting: is_self_starting(context), ..BootSettings::default() },
         polls,
         rpdos: rpdo::settings(problems, context, id),
         emergency: context.file.emergency.cob_id.as_ref().map(|at| at.value.of(id)),
         never_seen_after: NEVER_SEEN_AFTER,
     }
+}
+
+fn sdo(problems: &mut Problems, context: &Context<'_>) -> SdoSettings {
+    let (file, entry) = (&context.file.start, context.entry);
+    let defaults = SdoSettings::default();
+    let timeout = either(context, entry.sdo_timeout_ms.as_ref(), file.sdo_timeout_ms.as_ref());
+    let store = either(context, entry.store_timeout_ms.as_ref(), file.store_timeout_ms.as_ref());
+    SdoSettings {
+        timeout: milliseconds(problems, timeout, "sdo_timeout_ms", 10..=60_000, defaults.timeout),
+        store_timeout: milliseconds(
+            problems,
+            store,
+            "store_timeout_ms",
+            100..=60_000,
+            defaults.store_timeout,
+        ),
+        ..defaults
+    }
+}
+
+/// Whether the node starts by itself.
+fn is_self_starting(context: &Context<'_>) -> bool {
+    context.entry.self_starting.or(context.file.start.self_starting).unwrap_or(false)
+}
+
+/// The heartbeat that the node is to send, with the file that it stands in.
+pub fn heartbeat<'a>(context: &'a Context<'_>) -> Option<(&'a SourceText, &'a At<u64>)> {
+    either(context, context.entry.heartbeat_ms.as_ref(), context.file.error_control.heartbeat_ms.as_ref())
 }
 
 /// A TPDO without a timeout: its values stay good for ever, so that has to be meant. Where nothing else watches the node it
@@ -99,9 +129,12 @@ fn error_control(problems: &mut Problems, context: &Context<'_>) -> ErrorControl
     let guard_time = either(context, entry.guard_time_ms.as_ref(), file.guard_time_ms.as_ref());
     let reply = either(context, entry.guard_reply_ms.as_ref(), file.guard_reply_ms.as_ref());
     let factor = either(context, entry.life_time_factor.as_ref(), file.life_time_factor.as_ref());
-    let heartbeat = either(context, entry.heartbeat_timeout_ms.as_ref(), file.heartbeat_timeout_ms.as_ref());
-    let timeout =
-        milliseconds(problems, heartbeat, "heartbeat_timeout_ms", 10..=65_535, Duration::from_millis(1500));
+    // The time-out of the mapping is meant for the heartbeat of the mapping.
+    let own = file.heartbeat_timeout_ms.as_ref().filter(|_| entry.heartbeat_ms.is_none());
+    let after = either(context, entry.heartbeat_timeout_ms.as_ref(), own);
+    let three = heartbeat(context).map_or(500, |(_, at)| at.value.min(65_535));
+    let usual = Duration::from_millis(3 * three);
+    let timeout = milliseconds(problems, after, "heartbeat_timeout_ms", 10..=65_535, usual);
     let life_time_factor =
         factor.map(|(source, at)| problems.within(source, at, "life_time_factor", 1..=255));
     let rtr_dlc = file.rtr_dlc.as_ref().map(|at| problems.within(context.source, at, "rtr_dlc", 0..=8));
@@ -174,7 +207,8 @@ fn start(problems: &mut Problems, context: &Context<'_>) -> StartSettings {
     let confirm = either(context, entry.start_confirm_ms.as_ref(), file.start_confirm_ms.as_ref());
     let retry = either(context, entry.start_retry_ms.as_ref(), file.start_retry_ms.as_ref());
     StartSettings {
-        auto_start: entry.auto_start.or(file.auto_start).unwrap_or(defaults.auto_start),
+        auto_start: entry.auto_start.or(file.auto_start).unwrap_or(defaults.auto_start)
+            && !is_self_starting(context),
         delay: milliseconds(problems, delay, "start_delay_ms", 0..=65_535, defaults.delay),
         confirm: milliseconds(problems, confirm, "start_confirm_ms", 10..=65_535, defaults.confirm),
         retry: milliseconds(problems, retry, "start_retry_ms", 10..=65_535, defaults.retry),

@@ -51,6 +51,14 @@ pub struct StartSection {
     /// Send reset node when a lost node comes back. Default: false.
     #[serde(default)]
     pub reset_on_recovery: bool,
+    /// The node starts by itself (0x1F80): it is not started, and put into pre-operational only to be configured. Default: false.
+    pub self_starting: Option<bool>,
+    /// Store the parameters in the node (0x1010:1) after something was written. Its memory wears. Default: false.
+    pub save_after_config: Option<bool>,
+    /// How long the answer to a store may take, 100..=60000. Default: 3000.
+    pub store_timeout_ms: Option<At<u64>>,
+    /// How long any other SDO answer may take, 10..=60000. Default: 500.
+    pub sdo_timeout_ms: Option<At<u64>>,
 }
 
 /// `[tpdo.NUMBER]`.

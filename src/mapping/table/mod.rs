@@ -107,6 +107,8 @@ pub struct NodeDef {
     pub unit_id: u8,
     /// Added to every Modbus address.
     pub offset: u16,
+    /// It has to be there: that it never came is an alarm (CiA 302-2: a mandatory slave).
+    pub required: bool,
     /// What Modbus shows of invalid data.
     pub on_loss: OnLoss,
     /// Publish 0 instead of the last value when a value is not usable (R-DET-084). Off unless asked for.
