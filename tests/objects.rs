@@ -394,7 +394,7 @@ async fn clients_that_are_idle_slow_or_send_lines_without_end_do_not_stay() {
     let (client, _) = tasks.cia309(false);
     let (reading, mut writing) = tokio::io::split(client);
     let long = tokio::spawn(async move {
-        writing.write_all(&[b'x'; 100_000]).await.unwrap();
+        writing.write_all(&vec![b'x'; 100_000]).await.unwrap();
         writing.write_all(b"\r\n[5] info version\r\n").await.unwrap();
         writing
     });

@@ -264,10 +264,12 @@ impl Gateway {
 
 /// Why no value, or only a raw number, is made of what a device sends.
 fn unreadable(tag: &str, reason: Reason, unit: &str, wanted: &str) -> String {
-    let what = match reason {
-        Reason::UnknownDigits => "the device does not tell how many decimal digits it has".to_owned(),
-        Reason::OtherUnit => format!("the device gives it in {unit}, of which no {wanted} can be made"),
-        _ => format!("the device gives it in a unit that is not known: {unit}"),
+    let what = if reason == Reason::UnknownDigits {
+        "the device does not tell how many decimal digits it has".to_owned()
+    } else if reason == Reason::OtherUnit {
+        format!("the device gives it in {unit}, of which no {wanted} can be made")
+    } else {
+        format!("the device gives it in a unit that is not known: {unit}")
     };
     let consequence = if wanted == DEVICE_UNIT && reason != Reason::UnknownDigits {
         "the raw number is shown"

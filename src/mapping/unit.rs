@@ -97,7 +97,7 @@ impl Unit {
                 let (up, down) = (power_of_ten(shift), power_of_ten(-shift));
                 Some(Scale { multiply: own * up, divide: others * down, add: 0.0 })
             }
-            (None, None) => Some(self.base.to_celsius().then(other.base.from_celsius())),
+            (None, None) => Some(self.base.into_celsius().then(other.base.out_of_celsius())),
             (Some(_), None) | (None, Some(_)) => None,
         }
     }
@@ -120,7 +120,7 @@ impl Base {
         }
     }
 
-    fn to_celsius(self) -> Scale {
+    fn into_celsius(self) -> Scale {
         match self {
             Self::Fahrenheit => Scale { multiply: 5.0, divide: 9.0, add: -160.0 / 9.0 },
             Self::Kelvin => Scale { add: -273.15, ..Scale::IDENTITY },
@@ -128,7 +128,7 @@ impl Base {
         }
     }
 
-    fn from_celsius(self) -> Scale {
+    fn out_of_celsius(self) -> Scale {
         match self {
             Self::Fahrenheit => Scale { multiply: 9.0, divide: 5.0, add: 32.0 },
             Self::Kelvin => Scale { add: 273.15, ..Scale::IDENTITY },

@@ -376,11 +376,11 @@ fn a_transmitter_with_the_node_id_of_a_detcon_is_moved_configured_read_and_watch
     let (begin, messages) = (capture.mark(), subscriber.count());
     press.order("emcy F011");
     capture.wait_for("085#11F0210000000000", begin);
-    subscriber.wait_for("press/alarm/device_error", messages, |payload| payload["active"] == true);
+    subscriber.wait_for("press/alarm/pressure_error", messages, |payload| payload["active"] == true);
     let messages = subscriber.count();
     press.order("emcy clear");
     capture.wait_for("085#0000000000000000", begin);
-    subscriber.wait_for("press/alarm/device_error", messages, |payload| payload["active"] == false);
+    subscriber.wait_for("press/alarm/pressure_error", messages, |payload| payload["active"] == false);
 
     // Unplugged.
     wait_until_press_is_good(&gateway);

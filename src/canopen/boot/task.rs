@@ -116,13 +116,14 @@ impl Task {
         match self {
             Self::Identity { told: true, .. } => Advance::Done,
             Self::Identity { object, expected, tolerated, told } => {
-                match identity(*object, *expected, answer) {
-                    Advance::Failed(other @ BootFailure::Identity { .. }) if *tolerated => {
-                        *told = true;
-                        Advance::Tell(BootEvent::OtherDevice(other))
-                    }
-                    other => other,
+                let result = identity(*object, *expected, answer);
+                if let Advance::Failed(other @ BootFailure::Identity { .. }) = &result
+                    && *tolerated
+                {
+                    *told = true;
+                    return Advance::Tell(BootEvent::OtherDevice(other.clone()));
                 }
+                result
             }
             Self::Read { object, told } => read(*object, told, answer),
             Self::Write(write) => write.advance(answer),

@@ -34,6 +34,15 @@ pub(in crate::canopen) struct Answers {
     answer: Vec<u8>,
 }
 
+/// What a node says of the time between its heartbeats.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::canopen) enum HeartbeatTime {
+    /// This; zero = it sends none.
+    Told(Duration),
+    /// It refuses to tell, or to change it.
+    Unknown,
+}
+
 impl Answers {
     /// A request to the node. The heartbeat time that it writes, if it does.
     pub(in crate::canopen) fn handle_request(&mut self, now: Instant, frame: &CanFrame) -> Option<Duration> {
@@ -62,21 +71,20 @@ impl Answers {
         self.asked = now;
     }
 
-    /// An answer of the node: whether it is one too many; and the heartbeat time that it tells, or that it refuses to
-    /// tell or to change.
+    /// An answer of the node: whether it is one too many; and what it says of its heartbeat, if it does.
     pub(in crate::canopen) fn handle_answer(
         &mut self,
         now: Instant,
         frame: &CanFrame,
-    ) -> (Option<Extra>, Option<Option<Duration>>) {
+    ) -> (Option<Extra>, Option<HeartbeatTime>) {
         let &[command, a, b, c, low, high, ..] = frame.data() else { return (None, None) };
         let object = [a, b, c];
         let is_value = command & 0xE2 == 0x42;
         let heartbeat = match command >> 5 {
             2 if is_value && object == HEARTBEAT => {
-                Some(Some(Duration::from_millis(u16::from_le_bytes([low, high]).into())))
+                Some(HeartbeatTime::Told(Duration::from_millis(u16::from_le_bytes([low, high]).into())))
             }
-            4 if object == HEARTBEAT => Some(None),
+            4 if object == HEARTBEAT => Some(HeartbeatTime::Unknown),
             _ => None,
         };
         match command >> 5 {
@@ -179,8 +187,8 @@ mod tests {
         assert_eq!(ask("601#2B171000F4010000"), Some(Duration::from_millis(500)));
         assert_eq!(ask("601#2B181000F4010000"), None);
         let mut hear = |frame: &str| answers.handle_answer(Instant::START, &frame.parse().unwrap()).1;
-        assert_eq!(hear("581#4B171000F4010000"), Some(Some(Duration::from_millis(500))));
-        assert_eq!(hear("581#8017100002000106"), Some(None));
+        assert_eq!(hear("581#4B171000F4010000"), Some(HeartbeatTime::Told(Duration::from_millis(500))));
+        assert_eq!(hear("581#8017100002000106"), Some(HeartbeatTime::Unknown));
         assert_eq!(hear("581#6017100000000000"), None);
     }
 }

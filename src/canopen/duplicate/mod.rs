@@ -10,7 +10,7 @@ mod signs;
 
 use std::time::Duration;
 
-pub(super) use answers::{Answers, Extra};
+pub(super) use answers::{Answers, Extra, HeartbeatTime};
 use signs::{Alternation, BootUps, Rate};
 
 use super::{PdoIndex, PdoSettings};
@@ -198,8 +198,10 @@ impl Duplicate {
     /// An SDO answer of the node.
     pub(super) fn handle_sdo_answer(&mut self, now: Instant, frame: &CanFrame) -> Option<&'static str> {
         let (extra, heartbeat) = self.answers.handle_answer(now, frame);
-        if let Some(millis) = heartbeat {
-            self.heartbeats = millis.and_then(Rate::new);
+        match heartbeat {
+            Some(HeartbeatTime::Told(time)) => self.heartbeats = Rate::new(time),
+            Some(HeartbeatTime::Unknown) => self.heartbeats = None,
+            None => {}
         }
         let weight = match extra? {
             Extra::Same => 1,

@@ -46,10 +46,12 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
                 refuse_changes(problems, context, tpdo);
                 MappingMode::Adopt { timed: node::is_untimed(context, section) }
             }
-            word => match mapping_mode(word).filter(|_| !section.maps.is_empty()) {
-                Some(mode) => mode,
-                None => continue,
-            },
+            word @ (MappingWord::Write | MappingWord::Verify | MappingWord::Fixed) => {
+                match mapping_mode(word).filter(|_| !section.maps.is_empty()) {
+                    Some(mode) => mode,
+                    None => continue,
+                }
+            }
         };
         let mut number = |at: Option<(&SourceText, &At<u64>)>, what: &str, highest: u64| {
             at.map(|(source, at)| problems.within(source, at, what, 0..=highest))

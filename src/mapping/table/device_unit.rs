@@ -93,13 +93,13 @@ mod tests {
 
     const BAR: u32 = 0x004E_0000;
 
-    fn told(object: &str) -> Option<Told> {
-        Some(Told { object: object.parse().unwrap(), assumed: None })
+    fn told(object: &str) -> Told {
+        Told { object: object.parse().unwrap(), assumed: None }
     }
 
     fn integer(target: Option<&str>) -> DeviceUnit {
         let target = target.map(|text| Unit::from_text(text).unwrap());
-        DeviceUnit { unit: told("0x6131:1"), digits: told("0x6132:1"), target }
+        DeviceUnit { unit: Some(told("0x6131:1")), digits: Some(told("0x6132:1")), target }
     }
 
     fn value(reading: &Reading, raw: Value) -> f64 {
