@@ -250,8 +250,8 @@ mod tests {
             "it stands in bits 32 to 63 of its TPDO, but in bits 0 to 31 of its object"
         );
         assert_eq!(
-            tag("error_register").unwrap().told(&read(), &[5]).unwrap(),
-            "error_register = 5  (0x1001:0)"
+            tag("pressure_status").unwrap().told(&read(), &[5]).unwrap(),
+            "pressure_status = 5  (0x6150:1)"
         );
         assert!(pressure.told(&read(), &[1, 2]).unwrap().contains("2 bytes and not 4"));
     }
@@ -261,8 +261,8 @@ mod tests {
         let temperature = tag("temperature").unwrap();
         assert_eq!(temperature.bytes("-21.5"), Ok((-215_i32).to_le_bytes().to_vec()));
         assert_eq!(tag("pressure").unwrap().bytes("1.5"), Ok(1.5_f32.to_le_bytes().to_vec()));
-        assert_eq!(tag("error_register").unwrap().bytes("0x1F"), Ok(vec![0x1F]));
-        assert!(tag("error_register").unwrap().bytes("256").unwrap_err().contains("0 to 255"));
+        assert_eq!(tag("pressure_status").unwrap().bytes("0x1F"), Ok(vec![0x1F]));
+        assert!(tag("pressure_status").unwrap().bytes("256").unwrap_err().contains("0 to 255"));
         assert!(temperature.bytes("warm").is_err() && temperature.bytes("1e30").is_err());
     }
 
@@ -270,7 +270,7 @@ mod tests {
     fn a_name_that_is_no_object_is_refused_with_those_that_are() {
         let text = |name: &str| tag(name).err().unwrap();
         assert!(text("presure").contains("did you mean `pressure`?"));
-        assert!(text("pressure_invalid").contains("error_register"), "{}", text("pressure_invalid"));
+        assert!(text("pressure_invalid").contains("pressure_status"), "{}", text("pressure_invalid"));
         assert_eq!(of_mapping("no-such-mapping", 1).err(), Some(Exit::Configuration));
     }
 

@@ -23,7 +23,7 @@ const QUIET: Duration = Duration::from_secs(30);
 const GOES_ON: Duration = Duration::from_secs(1);
 /// Requests in a row that must have been answered twice: one might be chance.
 const ANSWERED_TWICE: u8 = 3;
-/// Lengths that take turns: there and back, and there again.
+/// Two lengths that take turns: there and back, and there again.
 const LENGTH_CHANGES: u8 = 3;
 /// Heartbeats and guard replies that take turns: there and back twice.
 const KIND_CHANGES: u8 = 4;

@@ -45,29 +45,34 @@ impl Rate {
     }
 }
 
-/// Watches whether something takes turns.
+/// Watches whether two values take turns.
 #[derive(Debug)]
 pub(super) struct Alternation<T> {
     last: Option<T>,
+    /// The other of the two.
+    other: Option<T>,
     changed: Instant,
     changes: u8,
 }
 
 impl<T> Default for Alternation<T> {
     fn default() -> Self {
-        Self { last: None, changed: Instant::START, changes: 0 }
+        Self { last: None, other: None, changed: Instant::START, changes: 0 }
     }
 }
 
 impl<T: PartialEq> Alternation<T> {
-    /// The next one. If it differs from the last: how many changes followed each other soon, this one included.
+    /// The next one. If it differs from the last: how many changes between these two followed each other soon, this one
+    /// included.
     pub(super) fn add(&mut self, now: Instant, next: T) -> Option<u8> {
         let before = self.last.replace(next);
         if before.is_none() || before == self.last {
             return None;
         }
+        let back = self.other == self.last;
+        self.other = before;
         let soon = now.since(self.changed) <= TURN;
-        self.changes = if soon { self.changes.saturating_add(1) } else { 1 };
+        self.changes = if soon && (back || self.changes == 0) { self.changes.saturating_add(1) } else { 1 };
         self.changed = now;
         Some(self.changes)
     }
@@ -75,6 +80,7 @@ impl<T: PartialEq> Alternation<T> {
     /// There is a reason why the next one may differ.
     pub(super) fn interrupt(&mut self) {
         self.last = None;
+        self.other = None;
         self.changes = 0;
     }
 }
@@ -146,6 +152,9 @@ mod tests {
         lengths.interrupt();
         assert_eq!(lengths.add(at(10_500), 5), None);
         assert_eq!(lengths.add(at(10_600), 8), Some(1));
+        assert_eq!(lengths.add(at(10_700), 5), Some(2));
+        assert_eq!(lengths.add(at(10_800), 0), Some(1), "a third length");
+        assert_eq!(lengths.add(at(10_900), 5), Some(2));
     }
 
     /// Times of boot-up messages in ms, and whether the first of them was ordered; when two devices were found.

@@ -178,9 +178,10 @@ fn demo_knocks_on_cylinder_7_by_second_8_then_loses_a_sensor_and_trips_within_mi
 }
 
 #[test]
-fn the_two_devices_of_the_demo_take_turns() {
+fn the_two_engines_of_the_demo_take_turns() {
     let plans = crate::simulator::demo();
     let mut devices: Vec<_> = plans.iter().map(|plan| plan.power_on(Now::from_millis(0))).collect();
+    devices.retain(|device| device.node().get() < 5);
     assert_eq!(devices.iter().map(|device| device.node().get()).collect::<Vec<_>>(), [1, 2]);
     let mut first_knock = [None; 2];
     for millis in (0..60_000).step_by(50) {
