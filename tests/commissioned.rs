@@ -213,3 +213,41 @@ fn r_dst_061_a_heartbeat_of_the_installation_brings_its_own_time_out() {
     let took = world.run_until(6100, |world| world.active_alarms().contains(&"node_lost"));
     assert!(took > 3900, "three times 2000 ms after the last one: {took}");
 }
+
+#[test]
+fn r_dst_062_a_node_supervises_the_gateway_only_where_that_is_asked_for() {
+    let quiet = world(MAPPING, |_| ());
+    assert!(!quiet.sent.iter().any(|frame| frame.starts_with("602#231610") || frame.starts_with("77E#")));
+    let sketch = Sketch::new().mapping(SourceText::new("own", MAPPING)).bus(|bus| {
+        bus.own_node_id = Some(At::nowhere(126));
+        bus.own_heartbeat_ms = Some(At::nowhere(1000));
+    });
+    let supervise = |node: &mut NodeEntry| node.supervise_gateway_ms = Some(At::nowhere(3000));
+    let (table, _) = sketch.clone().node("node002", 2, "own", supervise).build().unwrap();
+    let mut world = World::with(Arc::new(table), 1);
+    connect(&mut world);
+    world.run_for(1000);
+    world.start_gateway();
+    world.run_for(5000);
+    assert!(world.sent.contains("602#23161001B80B7E00"), "node 126, 3000 ms");
+    assert!(world.sent.contains("77E#05"));
+    assert_eq!(world.node(2).nmt, Some(NmtState::Operational));
+}
+
+#[test]
+fn r_dst_062_a_supervision_that_would_miss_the_gateway_at_once_is_refused() {
+    let supervise = |node: &mut NodeEntry| node.supervise_gateway_ms = Some(At::nowhere(1000));
+    for (own, heartbeat, message) in [
+        (None, None, "the gateway sends no heartbeat on this bus"),
+        (Some(126), Some(1000), "not longer than the time between two heartbeats"),
+        (None, Some(1000), "a heartbeat needs a node id"),
+    ] {
+        let sketch = Sketch::new().mapping(SourceText::new("own", MAPPING)).bus(|bus| {
+            bus.own_node_id = own.map(At::nowhere);
+            bus.own_heartbeat_ms = heartbeat.map(At::nowhere);
+        });
+        let problems = sketch.node("node002", 2, "own", supervise).build().unwrap_err();
+        let told: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        assert!(told.iter().any(|line| line.contains(message)), "{message}: {told:#?}");
+    }
+}

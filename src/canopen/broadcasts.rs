@@ -1,11 +1,11 @@
-//! SYNC and TIME: what is sent to everybody by the clock (CiA 301).
+//! SYNC, TIME and the own heartbeat: what is sent to everybody by the clock (CiA 301).
 //!
 //! Nothing of it is sent in the passive role, nor while the bus cannot be used. What did not leave is not sent later.
 
 use std::time::Duration;
 
 use super::beat::Beat;
-use super::{Role, SyncSettings, TimeSettings, cob_id};
+use super::{NmtState, OwnHeartbeatSettings, Role, SyncSettings, TimeSettings, cob_id};
 use crate::can::{CanFrame, CanId};
 use crate::time::{Instant, Now, Timestamp};
 
@@ -20,6 +20,7 @@ pub(super) struct Broadcasts {
     time_id: CanId,
     sync: Option<SyncProducer>,
     time: Option<TimeProducer>,
+    heartbeat: Option<HeartbeatProducer>,
     /// Synchronous TPDOs come within this long after SYNC.
     window: Option<Duration>,
     /// When the last SYNC was sent, or heard.
@@ -41,10 +42,21 @@ struct TimeProducer {
     unsynchronised: bool,
 }
 
+#[derive(Debug)]
+struct HeartbeatProducer {
+    beat: Beat,
+    id: CanId,
+}
+
 impl Broadcasts {
     /// Nothing is sent before [`resume`](Self::resume), and no TIME before [`set_clock`](Self::set_clock) unless the
     /// settings say otherwise.
-    pub(super) fn new(role: Role, sync: Option<SyncSettings>, time: Option<TimeSettings>) -> Self {
+    pub(super) fn new(
+        role: Role,
+        sync: Option<SyncSettings>,
+        time: Option<TimeSettings>,
+        heartbeat: Option<OwnHeartbeatSettings>,
+    ) -> Self {
         let master = role == Role::Master;
         let period = |sync: SyncSettings| sync.period.filter(|_| master && sync.produced);
         Self {
@@ -56,6 +68,10 @@ impl Broadcasts {
             time: time.filter(|_| master).map(|time| TimeProducer {
                 beat: Beat::new(time.period),
                 unsynchronised: time.unsynchronised,
+            }),
+            heartbeat: heartbeat.filter(|_| master).map(|heartbeat| HeartbeatProducer {
+                beat: Beat::new(heartbeat.period),
+                id: cob_id::error_control(heartbeat.node),
             }),
             window: sync.and_then(|sync| sync.window),
             last_sync: None,
@@ -84,6 +100,9 @@ impl Broadcasts {
             sync.counter = 0;
             sync.beat.start(now);
         }
+        if let Some(heartbeat) = &mut self.heartbeat {
+            heartbeat.beat.start(now);
+        }
         if let Some(time) = &mut self.time
             && (synchronised || time.unsynchronised)
         {
@@ -98,6 +117,9 @@ impl Broadcasts {
         }
         if let Some(time) = &mut self.time {
             time.beat.stop();
+        }
+        if let Some(heartbeat) = &mut self.heartbeat {
+            heartbeat.beat.stop();
         }
         self.last_sync = None;
     }
@@ -138,6 +160,15 @@ impl Broadcasts {
         CanFrame::data_frame(self.time_id, &time_of_day(now.utc)?)
     }
 
+    /// The heartbeat of the gateway that is due.
+    pub(super) fn take_heartbeat(&mut self, now: Instant) -> Option<CanFrame> {
+        let heartbeat = self.heartbeat.as_mut()?;
+        if !heartbeat.beat.take(now) {
+            return None;
+        }
+        CanFrame::data_frame(heartbeat.id, &[NmtState::Operational.code()])
+    }
+
     /// Somebody else's SYNC was heard.
     pub(super) fn heard_sync(&mut self, now: Instant) {
         self.last_sync = Some(now);
@@ -153,7 +184,9 @@ impl Broadcasts {
     pub(super) fn poll_timeout(&self) -> Option<(Instant, &'static str)> {
         let sync = self.sync.as_ref().and_then(|sync| sync.beat.due()).map(|due| (due, "SYNC"));
         let time = self.time.as_ref().and_then(|time| time.beat.due()).map(|due| (due, "TIME"));
-        sync.into_iter().chain(time).min_by_key(|(due, _)| *due)
+        let heartbeat = self.heartbeat.as_ref().and_then(|heartbeat| heartbeat.beat.due());
+        let heartbeat = heartbeat.map(|due| (due, "heartbeat of the gateway"));
+        sync.into_iter().chain(time).chain(heartbeat).min_by_key(|(due, _)| *due)
     }
 }
 

@@ -54,8 +54,9 @@ pub use network::Network;
 pub use nmt::{NmtRequest, NmtState};
 pub use node::SdoRefused;
 pub use settings::{
-    ErrorControl, GuardingSettings, NetworkSettings, NodeSettings, PdoIndex, PdoSettings, Role, RpdoIndex,
-    RpdoSettings, RpdoTrigger, StartSettings, SyncSettings, TimeSettings, TogglePolicy,
+    ErrorControl, GuardingSettings, NetworkSettings, NodeSettings, OwnHeartbeatSettings, PdoIndex,
+    PdoSettings, Role, RpdoIndex, RpdoSettings, RpdoTrigger, StartSettings, SyncSettings, TimeSettings,
+    TogglePolicy,
 };
 
 #[cfg(test)]

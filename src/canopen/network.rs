@@ -109,7 +109,7 @@ impl Network {
             standard: vec![Slot::Unknown; STANDARD_IDS],
             extended: BTreeMap::new(),
             strangers: Strangers { standard: vec![false; STANDARD_IDS], extended: BTreeSet::new() },
-            broadcasts: Broadcasts::new(settings.role, settings.sync, settings.time),
+            broadcasts: Broadcasts::new(settings.role, settings.sync, settings.time, settings.own_heartbeat),
             foreign_lss: None,
             outputs: Outputs::new(),
             link_up: false,
@@ -299,6 +299,9 @@ impl Network {
             self.sync(at);
         }
         if let Some(frame) = self.broadcasts.take_time(now) {
+            self.outputs.transmit(frame);
+        }
+        if let Some(frame) = self.broadcasts.take_heartbeat(at) {
             self.outputs.transmit(frame);
         }
         for place in 0..self.nodes.len() {

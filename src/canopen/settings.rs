@@ -30,6 +30,8 @@ pub struct NetworkSettings {
     pub sync: Option<SyncSettings>,
     /// TIME, where the gateway sends it; else it is 0x100 and somebody else's.
     pub time: Option<TimeSettings>,
+    /// The gateway's own heartbeat, where it sends one.
+    pub own_heartbeat: Option<OwnHeartbeatSettings>,
     /// The nodes; at most one for each node id (R-DET-004), no COB-ID twice. Of two equal ones the first counts.
     pub nodes: Vec<NodeSettings>,
 }
@@ -58,6 +60,16 @@ pub struct TimeSettings {
     pub period: Duration,
     /// Send it also while it is not known whether the clock of the host is right.
     pub unsynchronised: bool,
+}
+
+/// The heartbeat of the gateway itself, so that devices can tell whether it is there (CiA 301, R-DST-062). Sent in the
+/// role master only; its state is always operational.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OwnHeartbeatSettings {
+    /// The gateway's node id on this bus.
+    pub node: NodeId,
+    /// Time between two.
+    pub period: Duration,
 }
 
 /// One node.

@@ -72,6 +72,7 @@ impl Bus {
                     start_broadcast: def.is_some_and(|bus| bus.start_broadcast),
                     sync: def.and_then(|bus| bus.sync),
                     time: def.and_then(|bus| bus.time),
+                    own_heartbeat: def.and_then(|bus| bus.own_heartbeat),
                     nodes,
                 },
                 now,

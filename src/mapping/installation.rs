@@ -30,6 +30,8 @@ pub struct BusEntry {
     pub start_broadcast: bool,
     /// The gateway's own node id, 1..=127, where it has one: no node of this bus may use it (R-DET-004).
     pub own_node_id: Option<At<u64>>,
+    /// The gateway sends a heartbeat of its own, with `own_node_id`, every 10..=65535 ms. Default: none (R-DST-062).
+    pub own_heartbeat_ms: Option<At<u64>>,
     /// SYNC: the message after which synchronous PDOs are sent. Default: none.
     pub sync: Option<At<SyncEntry>>,
     /// TIME: tells the devices the time. Default: none.
@@ -46,6 +48,7 @@ impl BusEntry {
             bit_rate: None,
             start_broadcast: false,
             own_node_id: None,
+            own_heartbeat_ms: None,
             sync: None,
             time: None,
         }
@@ -168,6 +171,9 @@ pub struct NodeEntry {
     pub check_identity: Option<bool>,
     /// Heartbeat that the node is to send, 10..=65535 ms (R-DST-061).
     pub heartbeat_ms: Option<At<u64>>,
+    /// The node is told to supervise the gateway: it misses a heartbeat after 10..=65535 ms (0x1016, R-DST-062). Default: it
+    /// is not told anything.
+    pub supervise_gateway_ms: Option<At<u64>>,
     /// The node starts by itself (R-DST-059).
     pub self_starting: Option<bool>,
     /// Store the parameters in the node after something was written (R-DST-090).

@@ -5,8 +5,8 @@ use std::time::Duration;
 use super::bench::{Bench, master, mute};
 use crate::can::CanId;
 use crate::canopen::{
-    ErrorControl, Network, NetworkOutput, NetworkSettings, NodeSettings, PdoSettings, Role, SyncSettings,
-    TimeSettings, cob_id,
+    ErrorControl, Network, NetworkOutput, NetworkSettings, NodeId, NodeSettings, OwnHeartbeatSettings,
+    PdoSettings, Role, SyncSettings, TimeSettings, cob_id,
 };
 use crate::time::{Instant, Now, Timestamp};
 
@@ -43,6 +43,21 @@ fn r_dst_045_no_sync_without_being_asked_for_nor_in_the_passive_role_nor_where_a
     assert!(bench.run(60_000).take().is_empty());
     let other = SyncSettings { produced: false, ..SYNC };
     assert!(Bench::new(with(Some(other), None)).run(10_000).take().is_empty());
+}
+
+#[test]
+fn r_dst_062_the_own_heartbeat_says_operational_while_the_bus_can_be_used_and_is_off_in_the_passive_role() {
+    let node = NodeId::new(126).unwrap();
+    let own_heartbeat = Some(OwnHeartbeatSettings { node, period: Duration::from_secs(1) });
+    let settings = NetworkSettings { own_heartbeat, ..NetworkSettings::default() };
+    let mut bench = Bench::new(settings.clone());
+    assert_eq!(bench.run(2_500).take(), ["0 77E#05", "1000 77E#05", "2000 77E#05"]);
+    bench.link(2_600, false).run(9_000);
+    assert!(bench.take().is_empty(), "nothing while the bus cannot be used");
+    bench.link(9_100, true).run(9_200);
+    assert_eq!(bench.take(), ["9100 77E#05"]);
+    let passive = NetworkSettings { role: Role::Passive, ..settings };
+    assert!(Bench::new(passive).run(60_000).take().is_empty());
 }
 
 #[test]

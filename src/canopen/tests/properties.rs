@@ -9,8 +9,8 @@ use super::bench::{detcon, master, usable};
 use crate::can::{CanFrame, CanId};
 use crate::canopen::{
     ErrorControl, GuardingSettings, Network, NetworkOutput, NetworkSettings, NmtRequest, NmtState, NodeEvent,
-    NodeId, NodeSettings, Role, RpdoIndex, RpdoSettings, RpdoTrigger, StartSettings, SyncSettings,
-    TimeSettings, cob_id,
+    NodeId, NodeSettings, OwnHeartbeatSettings, Role, RpdoIndex, RpdoSettings, RpdoTrigger, StartSettings,
+    SyncSettings, TimeSettings, cob_id,
 };
 use crate::time::Now;
 
@@ -89,6 +89,8 @@ fn any_network() -> impl Strategy<Value = NetworkSettings> {
         window: None,
     };
     let time = TimeSettings { cob_id: cob_id::TIME, period: Duration::from_millis(90), unsynchronised: true };
+    let own_heartbeat =
+        OwnHeartbeatSettings { node: NodeId::new(126).unwrap(), period: Duration::from_millis(80) };
     let rpdo = RpdoSettings {
         number: 1,
         cob_id: RPDO,
@@ -103,6 +105,7 @@ fn any_network() -> impl Strategy<Value = NetworkSettings> {
             start_broadcast,
             sync: sends.then_some(sync),
             time: sends.then_some(time),
+            own_heartbeat: sends.then_some(own_heartbeat),
             nodes: vec![
                 NodeSettings {
                     error_control: first,
@@ -142,7 +145,10 @@ fn is_allowed(frame: &CanFrame, settings: &NetworkSettings) -> bool {
     let start = ids.iter().any(|id| *frame == NmtRequest::Start.frame(Some(*id)))
         || broadcast && *frame == NmtRequest::Start.frame(None);
     let guard = frame.is_remote() && ids.iter().any(|id| frame.id() == cob_id::error_control(*id));
-    start || guard || sent && settings.sync.is_some()
+    let heartbeat = settings.own_heartbeat.is_some_and(|own| {
+        Some(*frame) == CanFrame::data_frame(cob_id::error_control(own.node), &[NmtState::Operational.code()])
+    });
+    start || guard || heartbeat || sent && settings.sync.is_some()
 }
 
 proptest! {

@@ -15,6 +15,8 @@ use crate::canopen::boot::{BootStep, MappingMode, PdoSetup};
 use crate::canopen::object::{DataType, ObjectId};
 use crate::canopen::polls::Poll;
 
+/// Consumer heartbeat time of the first node that is supervised.
+const SUPERVISED: ObjectId = ObjectId::new(0x1016, 1);
 /// Producer heartbeat time.
 const HEARTBEAT: ObjectId = ObjectId::new(0x1017, 0);
 
@@ -35,6 +37,7 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
         let data = u16::try_from(millis).unwrap_or(u16::MAX).to_le_bytes().to_vec();
         steps.push(BootStep::Write { object: HEARTBEAT, data, optional: false });
     }
+    steps.extend(supervision_of_the_gateway(problems, context));
     let setups = context.file.setup.iter().filter_map(|section| setup(problems, context, section));
     steps.extend(setups);
     steps.extend(units::objects(context).into_iter().map(|(object, _)| BootStep::Read { object }));
@@ -94,6 +97,26 @@ pub fn mapping_mode(word: MappingWord) -> Option<MappingMode> {
         MappingWord::Write => Some(MappingMode::Write),
         MappingWord::Verify => Some(MappingMode::Verify),
     }
+}
+
+/// The node is told to watch over the gateway (R-DST-062): its node id and the time after which it is missed.
+fn supervision_of_the_gateway(problems: &mut Problems, context: &Context<'_>) -> Option<BootStep> {
+    let at = context.entry.supervise_gateway_ms.as_ref()?;
+    let millis = problems.within(context.config, at, "supervise_gateway_ms", 10..=65_535);
+    let heartbeat = context.bus.as_ref()?.own_heartbeat;
+    let wrong = match heartbeat {
+        None => "the gateway sends no heartbeat on this bus, so this node would miss it at once",
+        Some(heartbeat) if Duration::from_millis(millis) <= heartbeat.period => {
+            "this is not longer than the time between two heartbeats of the gateway"
+        }
+        Some(_) => "",
+    };
+    if !wrong.is_empty() {
+        let hint = "give the bus `own_node_id` and `own_heartbeat_ms`, and the node about three times that";
+        problems.error(context.config, &at.span, wrong, hint);
+    }
+    let value = u32::from(heartbeat?.node.get()) << 16 | u32::try_from(millis).ok()?;
+    Some(BootStep::Write { object: SUPERVISED, data: value.to_le_bytes().to_vec(), optional: false })
 }
 
 /// What is adopted is not changed.

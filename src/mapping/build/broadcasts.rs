@@ -1,4 +1,4 @@
-//! SYNC and TIME of a bus.
+//! SYNC, TIME and the own heartbeat of a bus.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use super::super::{At, SourceText};
 use super::network::restricted;
 use super::problems::Problems;
 use crate::can::CanId;
-use crate::canopen::{Role, SyncSettings, TimeSettings, cob_id};
+use crate::canopen::{NodeId, OwnHeartbeatSettings, Role, SyncSettings, TimeSettings, cob_id};
 
 /// Longest period and window, in us.
 const LONGEST: u64 = 60_000_000;
@@ -58,6 +58,27 @@ pub fn time(problems: &mut Problems, config: &SourceText, bus: &BusEntry) -> Opt
         period: Duration::from_secs(problems.within(config, period_s, "period_s", 1..=86_400)),
         unsynchronised: *unsynchronised,
     })
+}
+
+/// What the configuration says of the gateway's own node id and heartbeat.
+pub fn own_heartbeat(
+    problems: &mut Problems,
+    config: &SourceText,
+    bus: &BusEntry,
+) -> Option<OwnHeartbeatSettings> {
+    let node = bus.own_node_id.as_ref().map(|id| problems.within(config, id, "own_node_id", 1..=127));
+    let at = bus.own_heartbeat_ms.as_ref()?;
+    let millis = problems.within(config, at, "own_heartbeat_ms", 10..=65_535);
+    if node.is_none() {
+        let message = "a heartbeat needs a node id";
+        problems.error(config, &at.span, message, "give the bus `own_node_id` too, one that no device has");
+    }
+    if Role::from(bus.role) == Role::Passive {
+        let message = "the gateway is passive on this bus, so it sends no heartbeat";
+        problems.warning(config, &at.span, message, "leave it out");
+    }
+    let node = NodeId::new(u8::try_from(node?).ok()?)?;
+    Some(OwnHeartbeatSettings { node, period: Duration::from_millis(millis) })
 }
 
 fn period(problems: &mut Problems, config: &SourceText, entry: &SyncEntry) -> Option<Duration> {

@@ -129,9 +129,6 @@ fn buses(problems: &mut Problems, installation: &Installation<'_>) -> Vec<BusDef
             }
             known
         });
-        if let Some(id) = &entry.own_node_id {
-            problems.within(config, id, "own_node_id", 1..=127);
-        }
         buses.push(BusDef {
             name: name.value.clone(),
             role: entry.role.into(),
@@ -139,6 +136,7 @@ fn buses(problems: &mut Problems, installation: &Installation<'_>) -> Vec<BusDef
             start_broadcast: entry.start_broadcast,
             sync: broadcasts::sync(problems, config, entry),
             time: broadcasts::time(problems, config, entry),
+            own_heartbeat: broadcasts::own_heartbeat(problems, config, entry),
         });
     }
     buses

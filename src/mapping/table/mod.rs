@@ -17,7 +17,7 @@ use std::ops::Range;
 use std::time::Duration;
 
 use crate::can::BusIndex;
-use crate::canopen::{NodeSettings, Role, SyncSettings, TimeSettings};
+use crate::canopen::{NodeSettings, OwnHeartbeatSettings, Role, SyncSettings, TimeSettings};
 use crate::process_image::{NodeIndex, TagIndex};
 
 pub use alarm::*;
@@ -90,6 +90,8 @@ pub struct BusDef {
     pub sync: Option<SyncSettings>,
     /// TIME, where the gateway sends it.
     pub time: Option<TimeSettings>,
+    /// The gateway's own heartbeat, where it sends one.
+    pub own_heartbeat: Option<OwnHeartbeatSettings>,
 }
 
 /// A node.
