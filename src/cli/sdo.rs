@@ -311,7 +311,7 @@ mod tests {
 
     /// What the documents say on a node id that is written by SDO; then comes `cangate nmt reset-node`.
     #[tokio::test(start_paused = true)]
-    async fn v_dst_18_r_dst_011_117_118_120_node_id_and_bit_rate_are_written_and_saved() {
+    async fn v_dst_18_r_dst_011_117_118_120_121_node_id_and_bit_rate_are_written_and_saved() {
         for (bus, object, value, data_type, request, answer) in [
             ("sdo-node", "0x4F01:0", "5", Some(DataType::U8), "601#2F014F0005000000", "581#60014F0000000000"),
             ("sdo-rate", "0x4F00:0", "3", Some(DataType::U8), "601#2F004F0003000000", "581#60004F0000000000"),
