@@ -275,7 +275,7 @@ impl Network {
         true
     }
 
-    /// Reads or writes an object of a node. If it is taken, [`NodeEvent::Sdo`](super::NodeEvent::Sdo) with this id will
+    /// Reads or writes an object of a node. If it is taken, [`NodeEvent::Sdo`] with this id will
     /// follow, in bounded time. The highest bit of ids belongs to the boot of nodes.
     pub fn request_sdo(
         &mut self,

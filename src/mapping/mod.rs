@@ -12,7 +12,7 @@
 //! - [`eds`]: mappings made from EDS and DCF files.
 //! - [`expression`]: conditions on tags; [`expression_parser`] reads them.
 //! - [`objection`]: why a value should not be used as it stands.
-//! - [`unit`]: physical units that devices tell, and the way from one to another.
+//! - [`unit`](mod@unit): physical units that devices tell, and the way from one to another.
 //! - [`codec`]: raw bits to values, values to registers.
 //! - [`fingerprint`]: which mapping fits a node that was only overheard.
 //! - [`diagnostic`]: messages about files. [`reader`]: strict TOML; [`At`]: a value and its place; [`suggest`]: "did you mean".

@@ -25,7 +25,7 @@ pub struct AlarmDef {
     pub off_delay: Duration,
     /// Stays until acknowledged and reset.
     pub latch: bool,
-    /// Alarms that tell the cause, by their place in [`TagTable::alarms`].
+    /// Alarms that tell the cause, by their place in [`TagTable::alarms`](super::TagTable::alarms).
     pub suppressed_by: Vec<usize>,
     /// Takes part in its owner's first-out.
     pub first_out: bool,
