@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use cangate::can::{BusEvent, BusIndex, Link};
 use cangate::canopen::NodeId;
-use cangate::gateway::{Gateway, Input};
+use cangate::gateway::{Gateway, Input, Output};
 use cangate::mapping::installation::RoleWord;
 use cangate::mapping::{Sketch, SourceText, TagTable, check_mapping};
 use cangate::modbus::{ModbusSettings, RegisterMap};
@@ -179,7 +179,9 @@ fn r_dst_124_on_a_passive_bus_the_file_is_believed() {
     let frame = "182#0000C03F00".parse().unwrap();
     for event in [BusEvent::Link { link: Link::ErrorActive, at }, BusEvent::Frame { frame, at }] {
         gateway.handle_input(at, Input::Bus { bus: BusIndex(0), event });
-        while gateway.poll_output().is_some() {}
+        while let Some(output) = gateway.poll_output() {
+            assert!(!matches!(output, Output::Transmit { .. }), "{output:?}");
+        }
     }
     gateway.publish(&mut image);
     let tag = |name: &str| *image.tag(table.find_tag(NodeIndex(0), name).unwrap());

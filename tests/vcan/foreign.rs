@@ -303,6 +303,7 @@ fn python_canopen_as_a_second_client_of_a_transmitter_is_never_told_a_lie_and_di
     for tag in ["pressure_status", "temperature_status", "error_register"] {
         assert!(states.iter().all(|state| state.payload["tags"][tag] == 0), "{tag}");
     }
+    assert!(states.len() >= 5, "the gateway went on publishing: {}", states.len());
     println!("{} states of the gateway, none of them wrong", states.len());
     // That somebody else writes to the device is told, once; no alarm of the node is raised by it.
     let alarms: BTreeSet<String> = subscriber

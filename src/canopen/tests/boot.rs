@@ -67,6 +67,7 @@ impl Device {
         if self.mute || request.id() != CanId::Standard(0x601) {
             return None;
         }
+        assert_ne!(self.state, NmtState::Stopped, "{request}: a stopped node takes no SDO requests");
         let data: [u8; 8] = request.data().try_into().unwrap();
         let (low, high, sub) = (data[1], data[2], data[3]);
         let object = ObjectId::new(u16::from_le_bytes([low, high]), sub);
