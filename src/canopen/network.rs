@@ -181,6 +181,7 @@ impl Network {
         {
             // It was on its way when the bus went down: it counts, but sets no clock going.
             node.pause();
+            node.transfer(at, outputs);
         }
         if let Some(node) = &mut node {
             node.drive_rpdos(at, outputs);
@@ -230,6 +231,8 @@ impl Network {
             } else {
                 node.pause();
             }
+            // Who waits for an object learns at once that the bus went down; what begins anew is told of.
+            node.transfer(now.instant, &mut self.outputs);
             node.drive_rpdos(now.instant, &mut self.outputs);
         }
         if up {

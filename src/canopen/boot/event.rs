@@ -81,10 +81,11 @@ impl MappedPdo {
         u8::try_from(bits.div_ceil(8)).unwrap_or(8).min(8)
     }
 
-    /// Within which time it has to come: three event timers (R-DST-050). `None`: its event timer does not run.
+    /// Within which time it has to come: three event timers (R-DST-050). `None`: it is switched off, or its event timer does
+    /// not run.
     #[must_use]
     pub fn timeout(&self) -> Option<Duration> {
-        let timed = self.transmission_type >= 254 && self.event_timer > 0;
+        let timed = self.cob_id.is_some() && self.transmission_type >= 254 && self.event_timer > 0;
         timed.then(|| 3 * Duration::from_millis(self.event_timer.into()))
     }
 }

@@ -105,7 +105,9 @@ impl BootUps {
     /// A boot-up message.
     pub(super) fn add(&mut self, now: Instant, ordered: bool) {
         let third = self.pending.take().is_some();
-        let pair = self.last.filter(|(last, _)| !third && !self.paired && now.since(*last) <= TOGETHER);
+        // Of two resets, each brings one.
+        let soon = |last: Instant| !third && !ordered && !self.paired && now.since(last) <= TOGETHER;
+        let pair = self.last.filter(|(last, _)| soon(*last));
         if third || (pair.is_none() && !self.paired) {
             self.pairs = 0;
         }

@@ -94,9 +94,8 @@ impl Node {
         if !self.boot.is_empty() {
             self.boot.handle_boot_up(now);
             self.polls.stop();
-            if let Some(start) = &mut self.start {
-                start.handle_boot_begun();
-            }
+            // What was to be given back after a change was reset since.
+            self.taken_out = false;
             self.transfer(now, outputs);
         }
         self.unconfirmed_errors = false;

@@ -135,6 +135,9 @@ impl Node {
                 if event == BootEvent::Begun {
                     self.pdos.forget_lengths(|pdo| self.boot.asks_about(pdo));
                     self.polls.forget_carried();
+                    if let Some(start) = &mut self.start {
+                        start.handle_boot_begun();
+                    }
                 } else if let BootEvent::Mapped(mapped) = &event {
                     self.mapped(mapped);
                 }
@@ -155,6 +158,10 @@ impl Node {
                         Watch::Heartbeat(_) | Watch::Guarding(_) | Watch::Nothing => Duration::ZERO,
                     };
                     start.handle_boot_done(now, self.state == Some(NmtState::Operational), wait);
+                    // One that answers but does not tell its state is started when it does.
+                    if self.watch.is_lost() {
+                        start.cancel();
+                    }
                 }
             }
         }
