@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use cangate::can::{BusEvent, BusIndex, Link};
-use cangate::canopen::NodeId;
-use cangate::gateway::{Gateway, Input, Output};
+use cangate::canopen::{NmtRequest, NmtState, NodeId};
+use cangate::gateway::{Action, Gateway, Input, Outcome, Output};
 use cangate::mapping::installation::RoleWord;
 use cangate::mapping::{Sketch, SourceText, TagTable, check_mapping};
 use cangate::modbus::{ModbusSettings, RegisterMap};
@@ -65,7 +65,11 @@ fn table(text: &str, role: RoleWord) -> Arc<TagTable> {
 
 /// The gateway has run for 3 s beside a transmitter of 100 bar and 50 °C that was set up so.
 fn world(settings: &[&str]) -> World {
-    let mut world = World::with(table(MAPPING, RoleWord::Master), 1);
+    world_of(MAPPING, settings)
+}
+
+fn world_of(text: &str, settings: &[&str]) -> World {
+    let mut world = World::with(table(text, RoleWord::Master), 1);
     let scenario = Scenario::shipped(Kind::DstP92c, "quiet").unwrap();
     world.connect(&DevicePlan::new(NodeId::new(2).unwrap(), scenario));
     for line in ["pressure 100", "temperature 50", "set 1800 2 255", "set 1800 5 200"].iter().chain(settings)
@@ -133,6 +137,34 @@ fn r_dst_024_another_mapping_moves_them_and_what_comes_by_itself_is_not_read() {
 }
 
 #[test]
+fn r_dst_024_what_the_device_maps_with_fewer_bits_than_the_tag_has_is_read_all_the_same() {
+    let text = MAPPING.replace(
+        "[[derived]]",
+        "[[tag]]\nname = \"wide_status\"\nobject = \"0x6150:1\"\npoll_ms = 1000\ntype = \"u16\"\n[[derived]]",
+    );
+    let world = world_of(&text, &[]);
+    assert_eq!(world.tag(2, "pressure_status").quality, Quality::Good, "8 bits of it come");
+    assert!(reads_of(&world, "602#40506101"));
+    assert!(world.node(2).counters.sdo_errors > 0, "it has no 16 bits, which is told");
+}
+
+#[test]
+fn r_dst_034_what_is_read_is_not_good_after_a_reset_that_was_ordered_until_it_is_read_again() {
+    let mut world = world(&[]);
+    assert_eq!(world.tag(2, "temperature").quality, Quality::Good);
+    world.order("node 2 mute sdo on");
+    let reset = Action::Nmt { node: NodeIndex(0), request: NmtRequest::ResetNode };
+    assert_eq!(world.ask(reset), Outcome::Done);
+    world.run_until(1000, |world| world.node(2).nmt == Some(NmtState::Initialising));
+    for tag in ["temperature", "hot", "pressure"] {
+        assert_eq!(world.tag(2, tag).quality, Quality::Stale(Reason::NodeRestarted), "{tag}");
+    }
+    world.order("node 2 mute sdo off");
+    world.run_until(40_000, |world| world.tag(2, "temperature").quality.is_good());
+    assert_eq!(world.node(2).counters.restarts, 0, "it was no surprise");
+}
+
+#[test]
 fn r_dst_050_the_time_out_follows_from_the_event_timer_of_the_device() {
     let mut world = world(&["set 1800 5 700"]);
     world.order("node 2 mute pdo on");
@@ -160,10 +192,59 @@ fn r_dst_119_a_tpdo_with_another_identifier_is_heard_and_told_of() {
     assert_eq!(world.events("emergency_id_differs"), 0);
 }
 
+/// Whether an emergency message on this identifier raises an alarm, and one without an error ends it.
+fn hears_errors(world: &mut World, id: &str) -> bool {
+    world.overhear(&format!("{id}#0010010000000000"));
+    let heard = world.active_alarms() == ["emergency"];
+    world.overhear(&format!("{id}#0000000000000000"));
+    assert!(world.active_alarms().is_empty(), "{:?}", world.active_alarms());
+    heard
+}
+
+/// The TPDO is believed to be as the file says.
+fn fixed() -> String {
+    let maps = "mapping = \"fixed\"\nmaps = [\"0x9130:1/32\", \"0x6150:1/8\"]";
+    let float = MAPPING.find("[[tag]]\nname = \"pressure_float\"").unwrap();
+    let status = MAPPING.find("[[tag]]\nname = \"pressure_status\"").unwrap();
+    let text = [&MAPPING[..float], &MAPPING[status..]].concat();
+    text.replace("mapping = \"adopt\"", maps)
+}
+
 #[test]
-fn r_dst_119_emergency_messages_with_another_identifier_are_told_of() {
-    let world = world(&["set 1014 0 0x99"]);
-    assert_eq!(world.events("emergency_id_differs"), 1);
+fn r_dst_119_emergency_messages_with_another_identifier_are_heard_and_told_of() {
+    for text in [MAPPING.to_owned(), fixed()] {
+        let mut world = world_of(&text, &["set 1014 0 0x99"]);
+        assert_eq!(world.events("emergency_id_differs"), 1);
+        assert_eq!(
+            text_of(&world, "emergency_id_differs"),
+            "the device sends its emergency messages as 099, not as 082; that is used"
+        );
+        assert!(hears_errors(&mut world, "099"));
+        assert!(!hears_errors(&mut world, "082"), "it is not its any more");
+        world.order("node 2 set 1014 0 off");
+        let reset = Action::Nmt { node: NodeIndex(0), request: NmtRequest::ResetCommunication };
+        assert_eq!(world.ask(reset), Outcome::Done);
+        world.run_for(3000);
+        assert!(hears_errors(&mut world, "082"));
+        assert!(!hears_errors(&mut world, "099"));
+    }
+}
+
+#[test]
+fn r_dst_119_emergency_messages_that_the_device_has_switched_off_are_told_of() {
+    let mut world = world_of(&fixed(), &["set 1014 0 0x80000082"]);
+    assert!(text_of(&world, "emergency_id_differs").contains("switched off"));
+    assert!(!hears_errors(&mut world, "082"));
+}
+
+#[test]
+fn r_dst_088_what_is_read_is_read_though_nothing_else_is_asked() {
+    let text = fixed().replace("kind = \"heartbeat\"\nheartbeat_ms = 500", "kind = \"none\"");
+    let without_units = ["unit_object", "digits_object"];
+    let lines = text.lines().filter(|line| !without_units.iter().any(|key| line.starts_with(key)));
+    let text = lines.collect::<Vec<_>>().join("\n");
+    let world = world_of(&text, &[]);
+    assert_eq!(world.tag(2, "temperature").quality, Quality::Good);
 }
 
 #[test]

@@ -9,6 +9,7 @@ const MAY_IMPORT: &[(&str, &[&str])] = &[
     ("time", &[]),
     ("can", &["time"]),
     ("canopen", &["can::frame", "can::CanFrame", "can::CanId", "time"]),
+    ("esd", &["can::frame", "can::CanFrame", "can::CanId", "time"]),
     ("process_image", &["time", "canopen::NmtState", "canopen::emcy"]),
     (
         "mapping",
@@ -19,23 +20,36 @@ const MAY_IMPORT: &[(&str, &[&str])] = &[
             "canopen::settings",
             "canopen::Role",
             "canopen",
+            "esd",
             "can::BusIndex",
+            "can::CanFrame",
             "can::CanId",
             "can::BIT_RATES",
             "can::DEFAULT_BIT_RATE",
+            "slots::AllowList",
+            "slots::Network",
         ],
     ),
     ("alarms", &["process_image", "time"]),
-    ("gateway", &["can", "canopen", "process_image", "mapping", "alarms", "time"]),
+    ("access", &["process_image", "mapping", "slots::Network"]),
+    ("gateway", &["can", "canopen", "esd", "process_image", "mapping", "alarms", "access", "time"]),
+    ("base64", &[]),
+    ("store", &["time"]),
     ("slots", &["time"]),
-    ("modbus", &["process_image", "mapping", "gateway::command", "slots", "time"]),
-    ("mqtt", &["process_image", "mapping", "gateway::command", "time"]),
-    ("web", &["process_image", "mapping", "gateway::command", "slots", "time"]),
-    ("cia309", &["process_image", "mapping", "gateway::command", "canopen::object", "slots", "time"]),
+    ("tls", &["time"]),
+    ("modbus", &["process_image", "mapping", "gateway::command", "slots", "tls", "time"]),
+    ("mqtt", &["process_image", "mapping", "gateway::command", "base64", "store", "tls", "time"]),
+    ("web", &["process_image", "mapping", "gateway::command", "slots", "tls", "time"]),
+    (
+        "cia309",
+        &["process_image", "mapping", "gateway::command", "canopen::object", "base64", "slots", "time"],
+    ),
+    ("serial", &["process_image", "mapping", "gateway::command", "slots", "time"]),
     ("simulator", &["can", "canopen", "time"]),
     (
         "config",
         &[
+            "access",
             "can::interface",
             "cia309::settings",
             "mapping",
@@ -175,6 +189,7 @@ fn only_files_marked_io_touch_the_outside() {
         "socketcan::",
         "nix::",
         "rumqttc::",
+        "rumqttc5::",
         "axum::",
         "std::process",
     ];
@@ -196,6 +211,39 @@ fn only_files_marked_io_touch_the_outside() {
         wrong.extend(found.map(|line| format!("{name}: {}", line.trim())));
     }
     assert!(wrong.is_empty(), "files whose first line lacks [IO] touch the outside:\n{}", wrong.join("\n"));
+}
+
+/// Limits, evictions and socket options of a TCP server are in one place. The page has its own listener, as axum wants it, and a
+/// simulated serial line has one end.
+#[test]
+fn servers_listen_and_accept_through_slots() {
+    let exempt =
+        |name: &str| ["slots/", "web/", "simulator/serial_end.rs"].iter().any(|room| name.starts_with(room));
+    let wrong: Vec<String> = sources()
+        .iter()
+        .filter(|file| !exempt(&relative(file)))
+        .filter(|file| {
+            let code = without_comments(&without_tests(file));
+            ["TcpListener::bind", ".accept()"].iter().any(|word| code.contains(word))
+        })
+        .map(|file| relative(file))
+        .collect();
+    assert!(wrong.is_empty(), "servers beside `slots`: {wrong:?}");
+}
+
+/// Each frame is held against the list of those that are allowed: there is one place from which they go on.
+#[test]
+fn frames_leave_the_gateway_in_one_place() {
+    let ways: Vec<String> = sources()
+        .iter()
+        .filter(|file| room(file) == "gateway")
+        .flat_map(|file| {
+            let code = without_comments(&without_tests(file));
+            let found = code.matches("push_back(Output::Transmit").count();
+            vec![relative(file); found]
+        })
+        .collect();
+    assert_eq!(ways, ["gateway/bus.rs"]);
 }
 
 #[test]

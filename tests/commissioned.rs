@@ -254,3 +254,23 @@ fn r_dst_062_a_supervision_that_would_miss_the_gateway_at_once_is_refused() {
         assert!(told.iter().any(|line| line.contains(message)), "{message}: {told:#?}");
     }
 }
+
+#[test]
+fn r_dst_024_verify_withholds_another_content_and_only_tells_of_another_timer() {
+    let verify = MAPPING.replace("transmission_type = 255", "mapping = \"verify\"\ntransmission_type = 255");
+    let same = ["set 1A00 0 0", "set 1A00 1 0x61300120", "set 1A00 2 0x91300220", "set 1A00 0 2"];
+    for content in [&same[..], &[]] {
+        let mut world = World::with(table(&verify, |_| ()), 1);
+        let scenario = Scenario::shipped(Kind::DstP92c, "quiet").unwrap();
+        world.connect(&DevicePlan::new(NodeId::new(2).unwrap(), scenario));
+        for line in ["set 1800 2 255", "set 1800 5 200"].iter().chain(content) {
+            world.order(&format!("node 2 {line}"));
+        }
+        world.run_for(1000);
+        world.start_gateway();
+        world.run_for(5000);
+        assert_eq!(world.events("pdo_differs"), 1);
+        assert_eq!(world.tag(2, "temperature").quality.is_good(), !content.is_empty());
+        assert_eq!(world.events("pdo_mapping_differs"), usize::from(content.is_empty()));
+    }
+}

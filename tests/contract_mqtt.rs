@@ -4,6 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use cangate::modbus::{ModbusSettings, RegisterMap};
+use cangate::mqtt::BufferReport;
 use cangate::mqtt::json::JsonWriter;
 use cangate::mqtt::outbox::OutboxReport;
 use cangate::mqtt::payload::{self, Identity, Stamp};
@@ -13,11 +14,13 @@ use cangate::process_image::{
     Revision, Sample, Value,
 };
 
+use cangate::store::{State, StoreReport};
+
 use crate::support::plant::{at, event, image, lose, table};
 use crate::support::registers;
 
 /// Holds a payload, byte for byte, against its file.
-fn assert_golden(name: &str, payload: &str) {
+pub(crate) fn assert_golden(name: &str, payload: &str) {
     let _: serde_json::Value = serde_json::from_str(payload).expect("a payload is JSON");
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/contract").join(name);
     let golden = fs::read_to_string(&path).unwrap_or_default();
@@ -177,8 +180,40 @@ fn payload_of_the_bridge_info_and_health() {
         acknowledged: 95,
         ..OutboxReport::default()
     };
-    payload::health(&mut out, &table, &image, &identity(), at(61_500), &report);
+    payload::health(&mut out, &table, &image, &identity(), at(61_500), (&report, None));
     assert_golden("mqtt_health.json", &out);
+    let store = StoreReport {
+        state: State::Full,
+        reason: "cannot write into `/b`: No space left".into(),
+        records: [7, 311],
+        bytes: 52_311,
+        bytes_limit: 1 << 30,
+        dropped: [0, 3],
+        damaged: [1, 0],
+        faults: 2,
+        written: 131,
+        payload: 100,
+        ..StoreReport::default()
+    };
+    let buffer = BufferReport { store, hours_left: Some(1431.2) };
+    payload::health(&mut out, &table, &image, &identity(), at(61_500), (&report, Some(&buffer)));
+    assert_golden("mqtt_health_buffer.json", &out);
+}
+
+#[test]
+fn payload_of_the_history_is_that_of_a_state_that_says_so() {
+    let (table, mut out) = (table(2), String::new());
+    payload::state(&mut out, &table, &image(&table), NodeIndex(0), Stamp { sid: "3f0c", seq: 17 });
+    assert_golden("mqtt_history.json", &payload::historical(&out));
+}
+
+#[test]
+fn an_event_that_comes_out_of_the_store_is_the_one_that_went_in() {
+    let (table, mut out) = (table(1), String::new());
+    payload::event(&mut out, &table, &event(7), "3f0c");
+    let rest = payload::without_stream(&out, "3f0c", 7);
+    assert!(rest.len() < out.len());
+    assert_eq!(payload::with_stream("3f0c", 7, rest), out);
 }
 
 #[test]

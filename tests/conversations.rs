@@ -34,7 +34,7 @@ fn detcon_with(change: impl Fn(&mut BusEntry, &mut NodeEntry)) -> Conversation {
 }
 
 /// Node 1, everything as it is by default.
-fn detcon() -> Conversation {
+pub fn detcon() -> Conversation {
     detcon_with(|_, _| ())
 }
 
@@ -42,7 +42,7 @@ const QUIET: [&str; 4] =
     ["181#0000000000000000", "281#0000000000000000", "381#0000FF0F000099CC", "481#000000000000"];
 
 /// Lets node 1 be operational: it answers guarding and sends its TPDOs every 500 ms. Time: 1000 ms.
-fn running(mut conversation: Conversation) -> Conversation {
+pub fn running(mut conversation: Conversation) -> Conversation {
     conversation.answer_guarding(1, 5);
     for frame in QUIET {
         conversation.send_cyclically(frame, 500);

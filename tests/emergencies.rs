@@ -216,6 +216,23 @@ fn r_dst_077_a_code_that_the_mapping_does_not_name_is_shown_in_hex_with_its_clas
 }
 
 #[test]
+fn r_dst_078_an_alarm_tells_of_the_error_that_is_there_when_the_one_that_raised_it_has_gone() {
+    let mut world = running();
+    world.overhear("081#0020030000000000");
+    let place = world.table.alarms.iter().position(|alarm| alarm.name == "emergency").unwrap();
+    let shown = |world: &World| *world.image.alarm(AlarmIndex(place)).unwrap();
+    assert_eq!(shown(&world).value, Some(Value::Unsigned(0x2000)));
+    let before = shown(&world).revision;
+    world.run_for(10);
+    // Its bit of the error register is not set any more.
+    world.overhear("081#0031050000000000");
+    let status = shown(&world);
+    assert_eq!((status.value, status.count), (Some(Value::Unsigned(0x3100)), 1));
+    assert!(status.revision > before, "readers are told");
+    assert!(world.table.alarms[place].told(status.value).ends_with("Error code 0x3100 (mains voltage)."));
+}
+
+#[test]
 fn errors_of_a_lost_transmitter_are_not_good_and_its_alarms_are_told_by_the_loss() {
     let mut world = running();
     world.order("emcy F011");

@@ -9,6 +9,7 @@ use std::process::{Child, Command, Output, Stdio};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio_modbus::client::{Context, Reader, tcp};
 use tokio_modbus::slave::Slave;
 
@@ -245,11 +246,12 @@ async fn health_exits_with_0_while_the_gateway_is_ready_and_with_1_when_it_is_no
 async fn the_demo_shows_values_and_prints_what_to_connect_where() {
     let (modbus, mqtt, http) = (free_address(), free_address(), free_address());
     let [modbus_text, mqtt_text, http_text] = [modbus, mqtt, http].map(|address| address.to_string());
-    let arguments = ["demo", "--modbus", &modbus_text, "--mqtt", &mqtt_text, "--http", &http_text];
+    let mut arguments = vec!["demo", "--modbus", &modbus_text, "--mqtt", &mqtt_text, "--http", &http_text];
+    arguments.extend(["--serial", "127.0.0.1:0"]);
     let mut demo = Running::start(cangate().args(arguments));
     let mut lines = BufReader::new(demo.0.stdout.take().unwrap()).lines();
     let said: Vec<String> =
-        tokio::task::spawn_blocking(move || lines.by_ref().map_while(Result::ok).take(9).collect())
+        tokio::task::spawn_blocking(move || lines.by_ref().map_while(Result::ok).take(13).collect())
             .await
             .unwrap();
     let said = said.join("\n");
@@ -260,9 +262,12 @@ async fn the_demo_shows_values_and_prints_what_to_connect_where() {
         &mqtt.port().to_string(),
         &format!("http://{http}/"),
         "hydraulics",
+        "'cangate/demo/serial/serial/+/rx'",
     ] {
         assert!(said.contains(part), "`{part}` is missing in:\n{said}");
     }
+    let balance = said.lines().find(|line| line.contains("balance")).unwrap();
+    let [address, port] = [2, 3].map(|word| balance.split_whitespace().nth(word).unwrap());
     let mut client = connect(modbus, 1).await;
     let value = until("engine 1 has a knock intensity", async || {
         let registers = client.read_input_registers(100, 20).await.ok()?.ok()?;
@@ -276,6 +281,11 @@ async fn the_demo_shows_values_and_prints_what_to_connect_where() {
         (100.0..450.0).contains(&pressure).then_some(pressure)
     });
     assert!(pressure.await > 0.0, "in bar, not in the psi of its shipping state");
+    let mut line = tokio::net::TcpStream::connect(format!("{address}:{port}")).await.unwrap();
+    line.write_all(b"S\n").await.unwrap();
+    let mut weight = [0; 19];
+    tokio::time::timeout(PATIENCE, line.read_exact(&mut weight)).await.unwrap().unwrap();
+    assert!(weight.starts_with(b"S S ") && weight.ends_with(b" kg\r\n"), "{}", weight.escape_ascii());
     demo.signal(Signal::SIGINT);
     let (code, said) = tokio::task::spawn_blocking(move || demo.wait()).await.unwrap();
     assert_eq!(code, Some(0), "{said}");

@@ -147,7 +147,6 @@ guard_time_ms = 250
 life_time_factor = 4
 guard_reply_ms = 50
 toggle_check = "warn"
-heartbeat_timeout_ms = 3000
 auto_start = false
 start_delay_ms = 100
 start_confirm_ms = 500
@@ -158,7 +157,6 @@ strict_dlc = true
 required = false
 configure = true
 check_identity = false
-heartbeat_ms = 1000
 self_starting = false
 save_after_config = false
 store_timeout_ms = 5000
@@ -191,6 +189,9 @@ bus = "can1"
 id = 1
 mapping = "motortech-detcon"
 unit_id = 12
+error_control = "heartbeat"
+heartbeat_ms = 1000
+heartbeat_timeout_ms = 3000
 
 [modbus]
 listen = ["127.0.0.1:5020"]
@@ -213,11 +214,11 @@ fn an_installation_changes_what_it_may() {
     let table = &loaded.table;
     let node = &table.nodes[0];
     assert_eq!((node.unit_id, node.offset, node.on_loss, node.zero_on_bad), (11, 1000, OnLoss::Hold, true));
-    let ErrorControl::Guarding(guarding) = &node.canopen.error_control else { panic!("{node:?}") };
+    let ErrorControl::Guarding(guarding) = &node.canopen().unwrap().error_control else { panic!("{node:?}") };
     assert_eq!((guarding.guard_time.as_millis(), guarding.life_time_factor), (250, 4));
     assert_eq!((guarding.reply_timeout.as_millis(), guarding.toggle), (50, TogglePolicy::Warn));
-    assert!(!node.canopen.start.auto_start && node.canopen.start.reset_on_recovery);
-    assert!(node.canopen.pdos.iter().all(|pdo| pdo.strict_length && pdo.timeout.unwrap().as_millis() == 900));
+    assert!(!node.canopen().unwrap().start.auto_start && node.canopen().unwrap().start.reset_on_recovery);
+    assert!(node.pdos().iter().all(|pdo| pdo.strict_length && pdo.timeout.unwrap().as_millis() == 900));
     let tag = |name: &str| table.tag(table.find_tag(NodeIndex(0), name).unwrap()).unwrap();
     let field = |name: &str| match tag(name).source {
         Source::Pdo { field, .. } => field,
@@ -225,7 +226,8 @@ fn an_installation_changes_what_it_may() {
         | Source::Polled { .. }
         | Source::Adopted { .. }
         | Source::Rpdo { .. }
-        | Source::Emergency { .. } => {
+        | Source::Emergency { .. }
+        | Source::Module { .. } => {
             panic!("{name}")
         }
     };

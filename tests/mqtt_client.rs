@@ -1,162 +1,72 @@
 //! The MQTT client against good, slow and hostile brokers.
 
-use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use cangate::mqtt::back_off::Pace;
+use cangate::mqtt::MqttVersion;
 use cangate::mqtt::broker::EmbeddedBroker;
-use cangate::mqtt::client::run_at_pace;
-use cangate::mqtt::{Identity, MqttSettings, MqttStatus, Publisher};
-use cangate::process_image::handles::process_image;
-use cangate::process_image::{ImageWriter, ProcessImage, Revision, Value};
-use cangate::time::Clock;
+use cangate::process_image::Value;
 use proptest::prelude::*;
 use tokio::io::{AsyncWriteExt, BufReader};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
-use tokio_util::sync::CancellationToken;
 
 use crate::support::fake_broker::{Control, FakeBroker, Received, Script, read_packet, read_publish};
+use crate::support::mqtt_client::{Client, WINDOW, assert_delivered, free_address, seq, until};
 use crate::support::plant;
 
-/// Long enough for the slowest machine; no test waits this long when all is well.
-const PATIENCE: Duration = Duration::from_secs(60);
-const WINDOW: usize = 16;
-
-/// A client with its image.
-struct Client {
-    writer: ImageWriter,
-    status: watch::Receiver<MqttStatus>,
-    stop: CancellationToken,
-    task: JoinHandle<()>,
-}
-
-impl Client {
-    fn start(broker: SocketAddr) -> Self {
-        Self::start_with(broker, |_| {})
+/// Runs a test with each version of MQTT.
+async fn both(test: impl AsyncFn(MqttVersion)) {
+    for version in [MqttVersion::V3_1_1, MqttVersion::V5] {
+        test(version).await;
     }
-
-    fn start_with(broker: SocketAddr, change: impl FnOnce(&mut MqttSettings)) -> Self {
-        let mut settings = MqttSettings {
-            url: format!("mqtt://{broker}").parse().unwrap(),
-            inflight: u16::try_from(WINDOW).unwrap(),
-            ..MqttSettings::default()
-        };
-        change(&mut settings);
-        let table = plant::table(2);
-        let identity = Identity { sid: "s".into(), ..Identity::default() };
-        let (writer, reader) = process_image(plant::image(&table));
-        let publisher = Publisher::new(table, &settings, identity);
-        let (status_sender, status) = watch::channel(MqttStatus::default());
-        let stop = CancellationToken::new();
-        let pace = Pace {
-            first: Duration::from_millis(20),
-            longest: Duration::from_millis(40),
-            refused: Duration::from_millis(40),
-            silence: Duration::from_millis(200),
-            ..Pace::default()
-        };
-        let stopping = stop.clone();
-        let task = tokio::spawn(async move {
-            run_at_pace(settings, "hall-1", publisher, reader, Clock::start(), stopping, status_sender, pace)
-                .await;
-        });
-        Self { writer, status, stop, task }
-    }
-
-    fn change(&mut self, change: impl FnOnce(&mut ProcessImage)) {
-        self.writer.apply(|image| {
-            image.revision = Revision(image.revision.0 + 1);
-            change(image);
-        });
-    }
-
-    fn happen(&mut self, seq: u64) {
-        self.writer.apply(|image| plant::happen(image, seq));
-    }
-
-    async fn until(&mut self, what: impl FnMut(&MqttStatus) -> bool) -> MqttStatus {
-        tokio::time::timeout(PATIENCE, self.status.wait_for(what)).await.expect("in time").unwrap().clone()
-    }
-
-    async fn stop(self) {
-        self.stop.cancel();
-        tokio::time::timeout(PATIENCE, self.task).await.expect("in time").unwrap();
-    }
-}
-
-/// Waits until a condition holds.
-async fn until(what: &str, mut condition: impl FnMut() -> bool) {
-    let waiting = async {
-        while !condition() {
-            tokio::time::sleep(Duration::from_millis(5)).await;
-        }
-    };
-    tokio::time::timeout(PATIENCE, waiting).await.unwrap_or_else(|_| panic!("never: {what}"));
-}
-
-fn seq(payload: &str) -> u64 {
-    serde_json::from_str::<serde_json::Value>(payload).unwrap()["seq"].as_u64().unwrap()
-}
-
-/// The oracle: every event up to `last` arrived, first deliveries in order; the same event twice only with a
-/// reconnect between, the same bytes, and no more than a window of them for each reconnect.
-fn assert_delivered(events: &[(usize, String)], last: u64) {
-    let mut first: BTreeMap<u64, (usize, &str)> = BTreeMap::new();
-    let mut doubled: BTreeMap<usize, usize> = BTreeMap::new();
-    let mut newest = 0;
-    for (connection, payload) in events {
-        let seq = seq(payload);
-        if let Some((before, bytes)) = first.get(&seq) {
-            assert!(before < connection, "event {seq} twice in connection {connection}");
-            assert_eq!(bytes, payload, "event {seq} changed");
-            *doubled.entry(*connection).or_default() += 1;
-        } else {
-            assert_eq!(seq, newest + 1, "first deliveries are in order without a gap");
-            newest = seq;
-        }
-        first.insert(seq, (*connection, payload));
-    }
-    assert_eq!(newest, last);
-    assert!(doubled.values().all(|count| *count <= WINDOW), "{doubled:?}");
 }
 
 #[tokio::test]
 async fn a_session_has_the_last_will_and_the_client_id_and_begins_with_the_birth() {
-    let broker = FakeBroker::start(vec![Script::Good]).await;
-    let mut client = Client::start(broker.address);
-    client.until(|status| status.connected).await;
-    until("online", || !broker.payloads("bridge/state").is_empty()).await;
-    let connect = broker.seen(|seen| match &seen.control[0].1 {
-        Control::Connect(body) => String::from_utf8_lossy(body).into_owned(),
-        Control::Disconnect => panic!("CONNECT comes first"),
-    });
-    for part in ["cangate-hall-1", "cangate/hall-1/bridge/state", r#"{"state":"offline"}"#] {
-        assert!(connect.contains(part), "{part} in {connect:?}");
-    }
-    broker.seen(|seen| {
-        let last = seen.messages.last().unwrap();
-        assert_eq!((last.topic.as_str(), last.retain, last.qos), ("cangate/hall-1/bridge/state", true, 1));
-        assert_eq!(last.payload, r#"{"state":"online"}"#);
-        assert!(seen.messages.iter().all(|message| message.retain && message.qos == 1));
-    });
-    client.stop().await;
+    both(async |version| {
+        let broker = FakeBroker::start(vec![Script::Good]).await;
+        let mut client = Client::speaking(version, broker.address);
+        client.until(|status| status.connected).await;
+        until("online", || !broker.payloads("bridge/state").is_empty()).await;
+        let connect = broker.seen(|seen| match &seen.control[0].1 {
+            Control::Connect(body) => String::from_utf8_lossy(body).into_owned(),
+            Control::Disconnect => panic!("CONNECT comes first"),
+        });
+        for part in ["cangate-hall-1", "cangate/hall-1/bridge/state", r#"{"state":"offline"}"#] {
+            assert!(connect.contains(part), "{part} in {connect:?}");
+        }
+        broker.seen(|seen| {
+            let last = seen.messages.last().unwrap();
+            assert_eq!(
+                (last.topic.as_str(), last.retain, last.qos),
+                ("cangate/hall-1/bridge/state", true, 1)
+            );
+            assert_eq!(last.payload, r#"{"state":"online"}"#);
+            assert!(seen.messages.iter().all(|message| message.retain && message.qos == 1));
+        });
+        client.stop().await;
+    })
+    .await;
 }
 
 #[tokio::test]
 async fn a_stop_publishes_offline_and_disconnects() {
-    let broker = FakeBroker::start(vec![Script::Good]).await;
-    let mut client = Client::start(broker.address);
-    client.until(|status| status.connected).await;
-    client.happen(3);
-    client.stop().await;
-    assert_delivered(&broker.payloads("/event"), 3);
-    assert_eq!(broker.payloads("bridge/state").last().unwrap().1, r#"{"state":"offline"}"#);
-    until("DISCONNECT", || broker.seen(|seen| seen.control.last() == Some(&(0, Control::Disconnect)))).await;
+    both(async |version| {
+        let broker = FakeBroker::start(vec![Script::Good]).await;
+        let mut client = Client::speaking(version, broker.address);
+        client.until(|status| status.connected).await;
+        client.happen(3);
+        client.stop().await;
+        assert_delivered(&broker.payloads("/event"), 3);
+        assert_eq!(broker.payloads("bridge/state").last().unwrap().1, r#"{"state":"offline"}"#);
+        until("DISCONNECT", || broker.seen(|seen| seen.control.last() == Some(&(0, Control::Disconnect))))
+            .await;
+    })
+    .await;
 }
 
 #[tokio::test]
@@ -167,20 +77,24 @@ async fn a_stop_does_not_wait_for_a_broker_that_is_not_there() {
 
 #[tokio::test]
 async fn qos_0_is_for_states_only() {
-    let broker = FakeBroker::start(vec![Script::Good]).await;
-    let mut client =
-        Client::start_with(broker.address, |settings| settings.qos_state = 0.try_into().unwrap());
-    client.until(|status| status.connected).await;
-    until("online", || !broker.payloads("bridge/state").is_empty()).await;
-    broker.seen(|seen| {
-        for message in &seen.messages {
-            let expected =
-                u8::from(!message.topic.ends_with("e1/state") && !message.topic.ends_with("e2/state"));
-            assert_eq!(message.qos, expected, "{}", message.topic);
-        }
-    });
-    client.until(|status| status.outbox.messages == 0).await;
-    client.stop().await;
+    both(async |version| {
+        let broker = FakeBroker::start(vec![Script::Good]).await;
+        let mut client = Client::speaking_with(version, broker.address, |settings| {
+            settings.qos_state = 0.try_into().unwrap();
+        });
+        client.until(|status| status.connected).await;
+        until("online", || !broker.payloads("bridge/state").is_empty()).await;
+        broker.seen(|seen| {
+            for message in &seen.messages {
+                let expected =
+                    u8::from(!message.topic.ends_with("e1/state") && !message.topic.ends_with("e2/state"));
+                assert_eq!(message.qos, expected, "{}", message.topic);
+            }
+        });
+        client.until(|status| status.outbox.messages == 0).await;
+        client.stop().await;
+    })
+    .await;
 }
 
 #[tokio::test]
@@ -197,68 +111,87 @@ async fn p7_a_broker_that_is_absent_at_the_start_is_found_when_it_comes() {
 
 #[tokio::test]
 async fn f50_a_broker_that_drops_the_session_twenty_times_under_load_loses_no_event() {
-    let mut random = fastrand::Rng::with_seed(11);
-    let mut scripts: Vec<_> = (0..20).map(|_| Script::CloseAfter(random.usize(1..60))).collect();
-    scripts.push(Script::Good);
-    let broker = FakeBroker::start(scripts).await;
-    let mut client = Client::start(broker.address);
-    let mut last = 0;
-    while broker.seen(|seen| seen.connections) <= 20 {
-        last += 10;
-        client.happen(last);
-        tokio::time::sleep(Duration::from_millis(5)).await;
-    }
-    client.until(|status| status.connected && status.sessions == 21 && status.outbox.messages == 0).await;
-    client.stop().await;
-    assert_delivered(&broker.payloads("/event"), last);
+    both(async |version| {
+        let mut random = fastrand::Rng::with_seed(11);
+        let mut scripts: Vec<_> = (0..20).map(|_| Script::CloseAfter(random.usize(1..60))).collect();
+        scripts.push(Script::Good);
+        let broker = FakeBroker::start(scripts).await;
+        let mut client = Client::speaking(version, broker.address);
+        let mut last = 0;
+        while broker.seen(|seen| seen.connections) <= 20 {
+            last += 10;
+            client.happen(last);
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        client.until(|status| status.connected && status.sessions == 21 && status.outbox.messages == 0).await;
+        client.stop().await;
+        assert_delivered(&broker.payloads("/event"), last);
+    })
+    .await;
 }
 
 #[tokio::test]
 async fn acknowledgements_out_of_order_stop_nothing() {
-    let broker = FakeBroker::start(vec![Script::OutOfOrder(7), Script::Good]).await;
-    let mut client = Client::start(broker.address);
-    client.until(|status| status.connected).await;
-    client.happen(500);
-    until("500 events", || broker.payloads("/event").len() >= 500).await;
-    let events = broker.payloads("/event");
-    assert!(events.iter().all(|(connection, _)| *connection == 0));
-    assert_delivered(&events, 500);
+    both(async |version| {
+        let broker = FakeBroker::start(vec![Script::OutOfOrder(7), Script::Good]).await;
+        let mut client = Client::speaking(version, broker.address);
+        client.until(|status| status.connected).await;
+        client.happen(500);
+        until("500 events", || broker.payloads("/event").len() >= 500).await;
+        let events = broker.payloads("/event");
+        assert!(events.iter().all(|(connection, _)| *connection == 0));
+        assert_delivered(&events, 500);
+    })
+    .await;
 }
 
 #[tokio::test]
 async fn at_a_stop_a_broker_that_does_not_acknowledge_offline_is_left_to_its_last_will() {
-    let broker = FakeBroker::start(vec![Script::NeverAcknowledge]).await;
-    let mut client = Client::start(broker.address);
-    client.until(|status| status.connected && status.outbox.sent > 0).await;
-    client.stop().await;
-    until("the end of the connection", || broker.seen(|seen| seen.closed == 1)).await;
-    broker.seen(|seen| {
-        assert!(!seen.control.contains(&(0, Control::Disconnect)), "it would discard the last will");
-    });
+    both(async |version| {
+        let broker = FakeBroker::start(vec![Script::NeverAcknowledge]).await;
+        let mut client = Client::speaking(version, broker.address);
+        client.until(|status| status.connected && status.outbox.sent > 0).await;
+        client.stop().await;
+        until("the end of the connection", || broker.seen(|seen| seen.closed == 1)).await;
+        broker.seen(|seen| {
+            assert!(!seen.control.contains(&(0, Control::Disconnect)), "it would discard the last will");
+        });
+    })
+    .await;
 }
 
 #[tokio::test]
 async fn f53_a_broker_that_never_acknowledges_is_left_with_no_more_than_a_window_in_flight() {
-    let broker = FakeBroker::start(vec![Script::NeverAcknowledge, Script::Good]).await;
-    let mut client = Client::start_with(broker.address, |settings| settings.keep_alive_s = 1);
-    client.happen(100);
-    let status = client.until(|status| status.failures == 1).await;
-    assert_eq!(broker.seen(|seen| seen.messages.len()), WINDOW);
-    assert!(status.last_error.starts_with("the broker acknowledged nothing for "), "{}", status.last_error);
-    client.until(|status| status.connected && status.outbox.messages == 0).await;
-    client.stop().await;
-    assert_delivered(&broker.payloads("/event"), 100);
+    both(async |version| {
+        let broker = FakeBroker::start(vec![Script::NeverAcknowledge, Script::Good]).await;
+        let mut client = Client::speaking_with(version, broker.address, |settings| settings.keep_alive_s = 1);
+        client.happen(100);
+        let status = client.until(|status| status.failures == 1).await;
+        assert_eq!(broker.seen(|seen| seen.messages.len()), WINDOW);
+        assert!(
+            status.last_error.starts_with("the broker acknowledged nothing for "),
+            "{}",
+            status.last_error
+        );
+        client.until(|status| status.connected && status.outbox.messages == 0).await;
+        client.stop().await;
+        assert_delivered(&broker.payloads("/event"), 100);
+    })
+    .await;
 }
 
 #[tokio::test]
 async fn f54_wrong_acknowledgements_end_the_session_and_are_counted() {
-    let broker = FakeBroker::start(vec![Script::WrongAcknowledge, Script::Good]).await;
-    let mut client = Client::start(broker.address);
-    client.happen(10);
-    client.until(|status| status.failures >= 1).await;
-    client.until(|status| status.connected && status.outbox.messages == 0).await;
-    client.stop().await;
-    assert_delivered(&broker.payloads("/event"), 10);
+    both(async |version| {
+        let broker = FakeBroker::start(vec![Script::WrongAcknowledge, Script::Good]).await;
+        let mut client = Client::speaking(version, broker.address);
+        client.happen(10);
+        client.until(|status| status.failures >= 1).await;
+        client.until(|status| status.connected && status.outbox.messages == 0).await;
+        client.stop().await;
+        assert_delivered(&broker.payloads("/event"), 10);
+    })
+    .await;
 }
 
 #[tokio::test]
@@ -290,47 +223,55 @@ async fn f56_sessions_that_are_taken_over_again_and_again_name_the_likely_cause(
 
 #[tokio::test]
 async fn no_connack_ends_the_attempt_after_five_seconds() {
-    let broker = FakeBroker::start(vec![Script::Silent, Script::Good]).await;
-    let mut client = Client::start(broker.address);
-    let status = client.until(|status| status.failures == 1).await;
-    assert_eq!(status.last_error, "no answer within 5 s");
-    assert_eq!(status.sessions, 0);
-    client.until(|status| status.connected).await;
-    client.stop().await;
+    both(async |version| {
+        let broker = FakeBroker::start(vec![Script::Silent, Script::Good]).await;
+        let mut client = Client::speaking(version, broker.address);
+        let status = client.until(|status| status.failures == 1).await;
+        assert_eq!(status.last_error, "no answer within 5 s");
+        assert_eq!(status.sessions, 0);
+        client.until(|status| status.connected).await;
+        client.stop().await;
+    })
+    .await;
 }
 
 #[tokio::test]
 async fn f61_whatever_a_hostile_broker_sends_the_next_session_is_good() {
-    let mut random = fastrand::Rng::with_seed(5);
-    let mut hostile: Vec<Vec<u8>> =
-        (0..40).map(|_| (0..random.usize(1..200)).map(|_| random.u8(..)).collect()).collect();
-    // Packets that are well formed and make no sense here, and one that promises 256 MiB.
-    hostile.extend([
-        vec![0x20, 2, 0, 0],
-        vec![0x90, 3, 0, 1, 0],
-        vec![0x50, 2, 0, 1],
-        vec![0x62, 2, 0, 1],
-        vec![0x10, 0],
-        vec![0x30, 0xFF, 0xFF, 0xFF, 0x7F],
-        vec![0x32, 7, 0, 1, b'a', 0, 0, b'x', b'y'],
-        vec![0xD0, 0, 0xD0, 0],
-        vec![0xE0, 0],
-    ]);
-    let mut clients = tokio::task::JoinSet::new();
-    for (round, bytes) in hostile.into_iter().enumerate() {
-        clients.spawn(async move {
-            let scripts = vec![Script::Garbage { after_connack: round % 2 == 0, bytes }, Script::Good];
-            let broker = FakeBroker::start(scripts).await;
-            let mut client = Client::start_with(broker.address, |settings| settings.keep_alive_s = 1);
-            client.happen(50);
-            client.until(|status| status.connected && status.failures == 1).await;
-            client.until(|status| status.outbox.messages == 0).await;
-            client.stop().await;
-            let seqs: Vec<_> = broker.payloads("/event").iter().map(|(_, payload)| seq(payload)).collect();
-            assert_eq!(seqs.last(), Some(&50));
-        });
-    }
-    clients.join_all().await;
+    both(async |version| {
+        let mut random = fastrand::Rng::with_seed(5);
+        let mut hostile: Vec<Vec<u8>> =
+            (0..40).map(|_| (0..random.usize(1..200)).map(|_| random.u8(..)).collect()).collect();
+        // Packets that are well formed and make no sense here, and one that promises 256 MiB.
+        hostile.extend([
+            vec![0x20, 2, 0, 0],
+            vec![0x90, 3, 0, 1, 0],
+            vec![0x50, 2, 0, 1],
+            vec![0x62, 2, 0, 1],
+            vec![0x10, 0],
+            vec![0x30, 0xFF, 0xFF, 0xFF, 0x7F],
+            vec![0x32, 7, 0, 1, b'a', 0, 0, b'x', b'y'],
+            vec![0xD0, 0, 0xD0, 0],
+            vec![0xE0, 0],
+        ]);
+        let mut clients = tokio::task::JoinSet::new();
+        for (round, bytes) in hostile.into_iter().enumerate() {
+            clients.spawn(async move {
+                let scripts = vec![Script::Garbage { after_connack: round % 2 == 0, bytes }, Script::Good];
+                let broker = FakeBroker::start(scripts).await;
+                let mut client =
+                    Client::speaking_with(version, broker.address, |settings| settings.keep_alive_s = 1);
+                client.happen(50);
+                client.until(|status| status.connected && status.failures == 1).await;
+                client.until(|status| status.outbox.messages == 0).await;
+                client.stop().await;
+                let seqs: Vec<_> =
+                    broker.payloads("/event").iter().map(|(_, payload)| seq(payload)).collect();
+                assert_eq!(seqs.last(), Some(&50));
+            });
+        }
+        clients.join_all().await;
+    })
+    .await;
 }
 
 #[tokio::test]
@@ -350,22 +291,21 @@ async fn f49_what_does_not_fit_is_dropped_oldest_first_and_counted_exactly() {
 
 #[tokio::test]
 async fn a_slow_broker_gets_the_newest_state_and_every_event() {
-    let broker = FakeBroker::start(vec![Script::OutOfOrder(5)]).await;
-    let mut client = Client::start(broker.address);
-    client.until(|status| status.connected).await;
-    for round in 1..=200u32 {
-        client.change(|image| image.tags[0] = plant::good(Value::Float(f64::from(round % 100))));
-        client.happen(u64::from(round) * 5);
-        tokio::task::yield_now().await;
-    }
-    until("all events", || broker.payloads("/event").len() >= 1000).await;
-    assert_delivered(&broker.payloads("/event"), 1000);
-    let seqs: Vec<_> = broker.payloads("engine1/state").iter().map(|(_, payload)| seq(payload)).collect();
-    assert!(seqs.is_sorted(), "{seqs:?}");
-}
-
-async fn free_address() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap()
+    both(async |version| {
+        let broker = FakeBroker::start(vec![Script::OutOfOrder(5)]).await;
+        let mut client = Client::speaking(version, broker.address);
+        client.until(|status| status.connected).await;
+        for round in 1..=200u32 {
+            client.change(|image| image.tags[0] = plant::good(Value::Float(f64::from(round % 100))));
+            client.happen(u64::from(round) * 5);
+            tokio::task::yield_now().await;
+        }
+        until("all events", || broker.payloads("/event").len() >= 1000).await;
+        assert_delivered(&broker.payloads("/event"), 1000);
+        let seqs: Vec<_> = broker.payloads("engine1/state").iter().map(|(_, payload)| seq(payload)).collect();
+        assert!(seqs.is_sorted(), "{seqs:?}");
+    })
+    .await;
 }
 
 /// What a subscriber to everything received, and whether it is subscribed now.
@@ -446,25 +386,29 @@ impl Drop for Subscriber {
 
 #[tokio::test]
 async fn a_real_broker_delivers_events_keeps_state_and_publishes_the_last_will() {
-    let broker = EmbeddedBroker::start("127.0.0.1:0".parse().unwrap()).await.unwrap();
-    let early = Subscriber::start(broker.local_addr(), "early-bird");
-    until("subscribed", || early.is_subscribed()).await;
-    let mut client = Client::start(broker.local_addr());
-    client.until(|status| status.connected).await;
-    client.happen(200);
-    client.until(|status| status.outbox.events.0 == 200 && status.outbox.messages == 0).await;
-    until("events", || early.events().len() == 200).await;
-    assert_delivered(&early.events(), 200);
+    both(async |version| {
+        let broker = EmbeddedBroker::start("127.0.0.1:0".parse().unwrap()).await.unwrap();
+        let early = Subscriber::start(broker.local_addr(), "early-bird");
+        until("subscribed", || early.is_subscribed()).await;
+        let mut client = Client::speaking(version, broker.local_addr());
+        client.until(|status| status.connected).await;
+        client.happen(200);
+        client.until(|status| status.outbox.events.0 == 200 && status.outbox.messages == 0).await;
+        until("events", || early.events().len() == 200).await;
+        assert_delivered(&early.events(), 200);
 
-    let late = Subscriber::start(broker.local_addr(), "late-comer");
-    until("retained", || late.last("engine2/state").is_some() && late.last("bridge/state").is_some()).await;
-    assert_eq!(late.last("bridge/state").unwrap(), (r#"{"state":"online"}"#.to_owned(), true));
-    assert!(late.last("engine1/availability").unwrap().1);
-    assert!(late.events().is_empty(), "events are not retained");
+        let late = Subscriber::start(broker.local_addr(), "late-comer");
+        until("retained", || late.last("engine2/state").is_some() && late.last("bridge/state").is_some())
+            .await;
+        assert_eq!(late.last("bridge/state").unwrap(), (r#"{"state":"online"}"#.to_owned(), true));
+        assert!(late.last("engine1/availability").unwrap().1);
+        assert!(late.events().is_empty(), "events are not retained");
 
-    client.task.abort();
-    until("last will", || late.last("bridge/state").unwrap().0 == r#"{"state":"offline"}"#).await;
-    broker.shutdown().await;
+        client.task.abort();
+        until("last will", || late.last("bridge/state").unwrap().0 == r#"{"state":"offline"}"#).await;
+        broker.shutdown().await;
+    })
+    .await;
 }
 
 /// mosquitto, killed and started again at the same place.
@@ -543,42 +487,47 @@ async fn gate(broker: SocketAddr, open: watch::Receiver<bool>) -> (SocketAddr, J
 
 #[tokio::test]
 async fn p1_p5_p6_f50_mosquitto_killed_twenty_times_under_load_loses_no_event() {
-    let Some(mut mosquitto) = Mosquitto::start().await else { return };
-    let subscriber = Subscriber::start(mosquitto.address, "subscriber");
-    let (open, opened) = watch::channel(false);
-    let (address, gate) = gate(mosquitto.address, opened).await;
-    let mut client = Client::start(address);
-    let mut random = fastrand::Rng::with_seed(3);
-    let mut last = 0;
-    for round in 0..=20 {
-        until("subscribed", || subscriber.is_subscribed()).await;
-        open.send_replace(true);
-        let before = client.until(|status| status.connected).await.outbox.acknowledged;
-        for _ in 0..random.u32(1..40) {
-            last += random.u64(1..30);
-            client.happen(last);
-            tokio::task::yield_now().await;
+    both(async |version| {
+        let Some(mut mosquitto) = Mosquitto::start().await else { return };
+        let subscriber = Subscriber::start(mosquitto.address, "subscriber");
+        let (open, opened) = watch::channel(false);
+        let (address, gate) = gate(mosquitto.address, opened).await;
+        let mut client = Client::speaking(version, address);
+        let mut random = fastrand::Rng::with_seed(3);
+        let mut last = 0;
+        for round in 0..=20 {
+            until("subscribed", || subscriber.is_subscribed()).await;
+            open.send_replace(true);
+            let before = client.until(|status| status.connected).await.outbox.acknowledged;
+            for _ in 0..random.u32(1..40) {
+                last += random.u64(1..30);
+                client.happen(last);
+                tokio::task::yield_now().await;
+            }
+            // Some messages of this session are through, others are on their way.
+            client.until(|status| status.outbox.acknowledged > before || !status.connected).await;
+            if round == 20 {
+                break;
+            }
+            open.send_replace(false);
+            mosquitto.kill();
+            client.until(|status| !status.connected).await;
+            until("subscriber noticed", || !subscriber.is_subscribed()).await;
+            mosquitto.start_again();
         }
-        // Some messages of this session are through, others are on their way.
-        client.until(|status| status.outbox.acknowledged > before || !status.connected).await;
-        if round == 20 {
-            break;
-        }
-        open.send_replace(false);
-        mosquitto.kill();
-        client.until(|status| !status.connected).await;
-        until("subscriber noticed", || !subscriber.is_subscribed()).await;
-        mosquitto.start_again();
-    }
-    client
-        .until(|status| status.connected && status.outbox.messages == 0 && status.outbox.events.0 == last)
+        client
+            .until(|status| status.connected && status.outbox.messages == 0 && status.outbox.events.0 == last)
+            .await;
+        until("the last event", || {
+            subscriber.events().last().is_some_and(|(_, payload)| seq(payload) == last)
+        })
         .await;
-    until("the last event", || subscriber.events().last().is_some_and(|(_, payload)| seq(payload) == last))
-        .await;
-    assert_delivered(&subscriber.events(), last);
-    client.stop().await;
-    until("offline", || subscriber.last("bridge/state").unwrap().0 == r#"{"state":"offline"}"#).await;
-    gate.abort();
+        assert_delivered(&subscriber.events(), last);
+        client.stop().await;
+        until("offline", || subscriber.last("bridge/state").unwrap().0 == r#"{"state":"offline"}"#).await;
+        gate.abort();
+    })
+    .await;
 }
 
 proptest! {

@@ -366,3 +366,25 @@ fn at_a_stop_offline_goes_before_everything_that_still_waits() {
     bench.publisher.handle_acknowledged(farewell.id);
     assert!(bench.publisher.has_said_farewell() && bench.publisher.is_idle());
 }
+
+#[test]
+fn events_that_are_not_taken_for_now_come_again_after_a_minute_in_order_and_live_values_go_on() {
+    let mut bench = Bench::new();
+    happen(&mut bench.image, 3);
+    let mut refused = Vec::new();
+    bench.publisher.handle_image(at(1000), &bench.image);
+    while let Some(out) = bench.publisher.poll_output() {
+        refused.push(out.message.payload.to_string());
+        assert!(bench.publisher.handle_not_taken(at(1000), out.id, false).is_some());
+    }
+    assert_eq!(refused.len(), 1, "the others wait behind it");
+    bench.change(0, Value::Float(17.0));
+    assert_eq!(bench.topics(2000), ["engine1/state"]);
+    assert!(!bench.topics(60_999).contains(&"event".to_owned()));
+    let again = bench.sent(61_000);
+    let events: Vec<_> = again.iter().filter(|(topic, _)| topic == "event").collect();
+    assert_eq!(events.iter().map(|(_, event)| event["seq"].as_u64().unwrap()).collect::<Vec<_>>(), [1, 2, 3]);
+    let first: serde_json::Value = serde_json::from_str(&refused[0]).unwrap();
+    assert_eq!(events[0].1, first, "with the same bytes");
+    assert_eq!(bench.publisher.report().refused, 0);
+}

@@ -72,6 +72,41 @@ fn p22_a_detcon_with_the_node_id_of_a_transmitter_is_told_and_nothing_is_silentl
 }
 
 #[test]
+fn p22_a_detcon_and_a_transmitter_that_share_a_node_id_before_the_gateway_starts_are_told_whichever_is_meant()
+{
+    for node in [1, 2] {
+        for detcon_first in [true, false] {
+            let mut world = World::with(plant(), 1);
+            // Beside a DetCon a transmitter is seen only if it sends by itself: as delivered it waits for SYNC, without a
+            // heartbeat.
+            let mut plan = transmitter(node, if node == 1 { "demo" } else { "quiet" });
+            plan.story_after = std::time::Duration::from_secs(3600);
+            if detcon_first {
+                world.power_on(node, "quiet");
+                world.connect(&plan);
+            } else {
+                world.connect(&plan);
+                world.power_on(node, "quiet");
+            }
+            // Nobody listens to their boot-up messages.
+            world.run_for(5000);
+            world.start_gateway();
+            world.run_until(10_000, is_suspected);
+            world.run_for(60_000);
+            let reason = &world.node(node).reason;
+            let shared = format!("two devices seem to share node id {node}");
+            assert!(reason.contains(&shared), "node {node}, DetCon first: {detcon_first}: {reason}");
+            let tag = if node == 1 { "knock_intensity_9" } else { "pressure" };
+            assert_eq!(
+                world.tag(node, tag).quality,
+                Quality::Uncertain(Reason::DuplicateNode),
+                "node {node}, DetCon first: {detcon_first}"
+            );
+        }
+    }
+}
+
+#[test]
 fn p22_two_transmitters_with_one_node_id_are_told_within_five_seconds_and_their_values_are_uncertain() {
     let mut world = running();
     let mut plan = transmitter(2, "quiet");

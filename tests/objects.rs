@@ -8,7 +8,7 @@ use cangate::can::interface::Interface;
 use cangate::can::{self, BusIndex, Link};
 use cangate::canopen::{NmtRequest, NodeId};
 use cangate::cia309::{self, Session, Step};
-use cangate::gateway::command::{AbortCode, ObjectId};
+use cangate::gateway::command::{AbortCode, Door, ObjectId};
 use cangate::gateway::{self, Action, Desk, Gateway, Health, Outcome};
 use cangate::mapping::installation::RoleWord;
 use cangate::mapping::{Sketch, TagTable};
@@ -17,7 +17,7 @@ use cangate::modbus::{ModbusSettings, RegisterBank, RegisterMap, connection, gen
 use cangate::process_image::{Event, EventKind, NodeIndex, process_image};
 use cangate::simulator::task::BusEnd;
 use cangate::simulator::{self, DevicePlan, Kind, Scenario};
-use cangate::slots::Slots;
+use cangate::slots::{Clients, Limits, Place, ServerName};
 use cangate::time::Clock;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader, DuplexStream};
 use tokio::sync::{mpsc, watch};
@@ -168,6 +168,29 @@ fn r_dst_073_a_device_that_was_switched_off_times_out_and_the_others_do_not_noti
 }
 
 #[test]
+fn refused_writes_that_repeat_are_journalled_as_a_count_and_those_that_may_have_been_done_one_by_one() {
+    let mut world = running();
+    for value in 0..3 {
+        let refused = world.ask(write(TRANSMITTER, "0x1000:0", &[value; 4]));
+        assert_eq!(refused, Outcome::Aborted(AbortCode(0x0601_0002)));
+    }
+    assert_eq!(journalled(&world, "sdo_write").len(), 1);
+    world.run_for(61_000);
+    let told = &journalled(&world, "sdo_write")[1];
+    assert_eq!(told.to, "aborted");
+    assert!(
+        told.text.starts_with("2 more of these within 60 s, the last: 0x1000:0 = 02020202"),
+        "{}",
+        told.text
+    );
+    world.order("node 2 power off");
+    for _ in 0..2 {
+        assert_eq!(world.ask(write(TRANSMITTER, "0x1017:0", &[0, 0])), Outcome::Timeout);
+    }
+    assert_eq!(journalled(&world, "sdo_write").len(), 4);
+}
+
+#[test]
 fn nobody_comes_between_the_steps_of_a_boot() {
     let mut world = running();
     world.order("node 2 power off");
@@ -191,7 +214,7 @@ fn nobody_comes_between_the_steps_of_a_boot() {
 fn talk(world: &mut World, session: &mut Session, line: &str) -> String {
     match session.handle_line(line.as_bytes()) {
         Step::Nothing | Step::End => String::new(),
-        Step::Answer(text) => text,
+        Step::Answer(text) | Step::NotUnderstood(text) | Step::Last(text) | Step::Refused(text, _) => text,
         Step::Ask(action, asked) => asked.answer(&world.ask(action)),
     }
 }
@@ -280,8 +303,9 @@ fn tasks(name: &str) -> Tasks {
         writer,
         events,
         vec![transmit],
-        commands,
+        commands.into(),
         health,
+        mpsc::channel(1).1,
         clock,
         stop.clone(),
     ));
@@ -289,6 +313,12 @@ fn tasks(name: &str) -> Tasks {
 }
 
 impl Tasks {
+    /// A place that nobody else wants.
+    fn place(&self) -> Place {
+        let clients = Clients::new(ServerName::new("test", "[test]"), Limits::places(1), self.stop.clone());
+        clients.take([127, 0, 0, 1].into())
+    }
+
     /// A CiA 309-3 connection; gives the client's end and why it ended.
     fn cia309(&self, writes: bool) -> (DuplexStream, tokio::task::JoinHandle<&'static str>) {
         let (near, far) = tokio::io::duplex(1024);
@@ -299,11 +329,9 @@ impl Tasks {
             clock: self.clock,
             idle_timeout: Some(Duration::from_secs(600)),
         };
-        let stops = cia309::connection::Stops { evict: CancellationToken::new(), stop: self.stop.clone() };
-        let activity = Slots::new(1).take([127, 0, 0, 1].into(), ()).activity;
-        let serving = async move {
-            cia309::connection::serve(near, "client".to_owned(), &shared, &activity, &stops).await
-        };
+        let place = self.place();
+        let serving =
+            async move { cia309::connection::serve(near, "client".to_owned(), &shared, &place).await };
         (far, tokio::spawn(serving))
     }
 
@@ -314,19 +342,20 @@ impl Tasks {
         let map = RegisterMap::build(&table, &settings, "cangate").unwrap();
         let (_, reader) = process_image(Gateway::new(Arc::clone(&table), self.clock.now()).empty_image());
         let shared = connection::Shared {
-            bank: RegisterBank::new(table, Arc::new(map)),
+            bank: RegisterBank::new(table, Arc::new(map)).into(),
             reader,
             clock: self.clock,
             counters: Arc::default(),
+            accounts: Arc::default(),
+            rate: None,
             idle_timeout: None,
             partial_frame_timeout: settings.partial_frame_timeout(),
             send_timeout: settings.send_timeout(),
             objects,
+            writers: None,
         };
-        let stops = connection::Stops { evict: CancellationToken::new(), stop: self.stop.clone() };
-        let activity = Slots::new(1).take([127, 0, 0, 1].into(), ()).activity;
-        let peer = "127.0.0.1:1".parse().unwrap();
-        tokio::spawn(async move { connection::serve(near, peer, &shared, &activity, &stops).await });
+        let (place, peer) = (self.place(), "127.0.0.1:1".parse().unwrap());
+        tokio::spawn(async move { connection::serve(near, peer, &shared.into(), &place).await });
         far
     }
 }
@@ -391,17 +420,39 @@ async fn clients_that_are_idle_slow_or_send_lines_without_end_do_not_stay() {
     browser.read_to_end(&mut nothing).await.unwrap();
     assert_eq!((ended.await.unwrap(), nothing.len()), ("http", 0), "and no node was stopped");
 
-    let (client, _) = tasks.cia309(false);
-    let (reading, mut writing) = tokio::io::split(client);
-    let long = tokio::spawn(async move {
-        writing.write_all(&vec![b'x'; 100_000]).await.unwrap();
-        writing.write_all(b"\r\n[5] info version\r\n").await.unwrap();
-        writing
-    });
-    let mut lines = BufReader::new(reading).lines();
-    assert!(lines.next_line().await.unwrap().unwrap().starts_with("[0] ERROR:600"));
-    assert!(lines.next_line().await.unwrap().unwrap().starts_with("[5] 0 0"));
-    drop(long.await.unwrap());
+    tasks.stop.cancel();
+}
+
+/// What a web page makes a browser send: an address that is longer than a line may be, and lines of CiA 309-3 behind it.
+#[tokio::test(start_paused = true)]
+async fn a_line_that_is_too_long_is_the_last_one_and_what_follows_it_is_not_obeyed() {
+    let tasks = tasks("objects-309-long");
+    let (client, ended) = tasks.cia309(true);
+    let (mut reading, mut writing) = tokio::io::split(client);
+    let request = format!(
+        "POST /{} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n1 stop\r\n[5] info version\r\n",
+        "x".repeat(20_000)
+    );
+    // Who has read the answer may hang up before all was sent.
+    let browser = tokio::spawn(async move { drop(writing.write_all(request.as_bytes()).await) });
+    let mut answers = String::new();
+    reading.read_to_string(&mut answers).await.unwrap();
+    assert_eq!(answers, "[0] ERROR:600 #a line has at most 16384 bytes\r\n", "and no node was stopped");
+    assert_eq!(ended.await.unwrap(), "too_long");
+    browser.await.unwrap();
+    tasks.stop.cancel();
+}
+
+/// What a web page makes a browser send that speaks TLS: a session ticket of the page's choice in the hello.
+#[tokio::test(start_paused = true)]
+async fn a_line_that_is_no_text_is_the_last_one_and_what_follows_it_is_not_obeyed() {
+    let tasks = tasks("objects-309-tls");
+    let (mut client, ended) = tasks.cia309(true);
+    client.write_all(b"\x16\x03\x01\x02\x00\x01\x00\n[5] info version\r\n1 stop\r\n").await.unwrap();
+    let mut answers = String::new();
+    client.read_to_string(&mut answers).await.unwrap();
+    assert!(answers.starts_with("[0] ERROR:101 ") && answers.lines().count() == 1, "{answers}");
+    assert_eq!(ended.await.unwrap(), "no_text");
     tasks.stop.cancel();
 }
 
@@ -453,8 +504,10 @@ async fn fc_43_13_is_off_or_reads_only_unless_told_otherwise() {
     let mut client = tasks.modbus(Some(connection::Objects { desk: tasks.desk.clone(), write: false }));
     client.write_all(&frame(1, 2, &WRITE_OFFSET)).await.unwrap();
     assert_eq!(answer(&mut client).await, (1, vec![0xAB, 3]));
+    assert_eq!(tasks.desk.refused()[0], (Door::Modbus, 1), "the write is told of");
     client.write_all(&frame(2, 2, &READ_VENDOR)).await.unwrap();
     assert_eq!(answer(&mut client).await.1.len(), 16);
+    assert_eq!(tasks.desk.refused()[0], (Door::Modbus, 1));
     tasks.stop.cancel();
 }
 

@@ -76,7 +76,7 @@ fn sketch(mapping: &str, change: impl Fn(&mut BusEntry, &mut NodeEntry)) -> Sket
 /// The drive with outputs enabled, operational from 1 ms on.
 fn drive_with(mapping: &str) -> Conversation {
     let mut conversation =
-        Conversation::new(sketch(mapping, |_, node| node.outputs = true).build().unwrap().0);
+        Conversation::new(sketch(mapping, |_, node| node.outputs = At::nowhere(true)).build().unwrap().0);
     conversation.answer_guarding(1, 5);
     conversation
 }
@@ -89,7 +89,7 @@ fn rpdos(conversation: &Conversation) -> Vec<String> {
 
 fn write(conversation: &mut Conversation, tag: &str, value: Value) -> Outcome {
     let tag = conversation.tag_index(tag);
-    conversation.command(Action::WriteTag { tag, value })
+    conversation.command(Action::WriteTags { writes: vec![(tag, value)] })
 }
 
 #[test]
@@ -115,7 +115,7 @@ fn r_dst_124_nothing_is_sent_in_the_passive_role() {
             unsynchronised: true,
             ..Default::default()
         }));
-        node.outputs = true;
+        node.outputs = At::nowhere(true);
     };
     let (table, warnings) = sketch(DRIVE, passive).build().unwrap();
     let told: Vec<String> = warnings.iter().map(|warning| warning.message.clone()).collect();
@@ -168,7 +168,7 @@ fn a_write_is_checked_whole_before_anything_is_sent() {
         let Outcome::Rejected(why) = write(&mut conversation, tag, value) else { panic!("{tag} = {value}") };
         assert!(why.contains(part), "{tag} = {value}: {why}");
     }
-    let unknown = Action::WriteTag { tag: TagIndex(9_999), value: Value::Unsigned(1) };
+    let unknown = Action::WriteTags { writes: vec![(TagIndex(9_999), Value::Unsigned(1))] };
     assert_eq!(conversation.command(unknown), Outcome::Unknown);
     assert_eq!(rpdos(&conversation), before);
 }
@@ -178,8 +178,8 @@ fn a_write_that_the_bus_does_not_take_is_busy_and_as_if_it_had_not_been_asked_fo
     let mut conversation = drive_with(DRIVE);
     conversation.run_to(100);
     let now = Now::from_millis(100);
-    let action = Action::WriteTag { tag: conversation.tag_index("mode"), value: Value::Unsigned(9) };
-    let command = Command { id: 7, source: CommandSource::Mqtt("test".into()), action };
+    let action = Action::WriteTags { writes: vec![(conversation.tag_index("mode"), Value::Unsigned(9))] };
+    let command = Command { id: 7, source: CommandSource::mqtt("test".into()), action };
     conversation.gateway.handle_input(now, Input::Command(command));
     let mut outcome = None;
     while let Some(output) = conversation.gateway.poll_output() {
@@ -215,6 +215,25 @@ fn outputs_stop_with_the_node_and_begin_again_with_the_defaults_or_the_last_valu
         assert_eq!(rpdos(&conversation)[sent], expected);
         assert!(conversation.tag("mode").quality.is_good());
     }
+}
+
+#[test]
+fn what_a_node_is_sent_is_not_doubtful_because_another_has_its_id() {
+    let mut conversation = drive_with(&DRIVE.replace("refresh_ms = 400\n", ""));
+    conversation.send_cyclically("181#05", 500);
+    conversation.run_to(1_000);
+    conversation.frame("081#5081010000000000");
+    for millis in [1_000, 60_000] {
+        conversation.run_to(millis);
+        assert_eq!(conversation.tag("setpoint").quality, Quality::Good, "{millis}");
+    }
+    assert_eq!(conversation.events_named("duplicate_node_cleared").len(), 1);
+    conversation.frame("081#5081010000000000");
+    assert_eq!(
+        conversation.tag("level").quality,
+        Quality::Uncertain(Reason::DuplicateNode),
+        "it may be either's"
+    );
 }
 
 #[test]
@@ -276,6 +295,11 @@ fn mistakes_about_rpdos_are_told_with_the_way_out() {
             "refresh_ms = 400\ntransmission_type = 1",
             "refresh_ms means nothing for an RPDO that follows SYNC",
         ),
+        (
+            "refresh_ms = 400",
+            "inhibit_ms = 20\ntransmission_type = 1",
+            "inhibit_ms means nothing for an RPDO that follows SYNC",
+        ),
         ("refresh_ms = 400", "transmission_type = 1", "RPDO 1 waits for SYNC (transmission type 1)"),
         ("rpdo = 1\nbit = 16", "rpdo = 2\nbit = 16", "there is no RPDO `2`"),
         ("rpdo = 1\nbit = 16", "rpdo = 1\nbit = 8", "`setpoint` and `enable` are written to the same bits"),
@@ -297,7 +321,7 @@ fn mistakes_about_rpdos_are_told_with_the_way_out() {
     ] {
         let text = DRIVE.replacen(right, wrong, 1);
         assert_ne!(text, DRIVE, "{right}");
-        let told = told(sketch(&text, |_, node| node.outputs = true).build());
+        let told = told(sketch(&text, |_, node| node.outputs = At::nowhere(true)).build());
         assert!(
             told.iter().any(|line| line.contains(message) && line.contains("hint: ")),
             "{wrong}: {told:#?}"
@@ -329,7 +353,7 @@ fn by_sync(producer: Option<ProducerWord>) -> Result<(TagTable, Vec<Diagnostic>)
 #[test]
 fn r_dst_050_the_timeout_of_a_synchronous_tpdo_is_three_of_its_cycles() {
     let timeout =
-        |result: Result<(TagTable, Vec<Diagnostic>), _>| result.unwrap().0.nodes[0].canopen.pdos[0].timeout;
+        |result: Result<(TagTable, Vec<Diagnostic>), _>| result.unwrap().0.nodes[0].pdos()[0].timeout;
     assert_eq!(timeout(by_sync(Some(ProducerWord::Gateway))), Some(Duration::from_millis(300)));
     assert_eq!(timeout(by_sync(Some(ProducerWord::Other))), Some(Duration::from_millis(300)));
     let usual = Sketch::new().node("node001", 1, "danfoss-dst-p92c", |_| ()).build();
@@ -361,7 +385,7 @@ fn mistakes_about_sync_and_time_are_told() {
     };
     for (lines, message) in [
         ("sync = {}", "SYNC has no period"),
-        ("sync = { period_ms = 0 }", "period_ms 0 is out of range"),
+        ("sync = { period_ms = 60001 }", "period_ms 60001 is out of range"),
         ("sync = { period_us = 999 }", "period_us 999 is out of range"),
         ("sync = { period_ms = 1, period_us = 1000 }", "SYNC has two periods"),
         ("sync = { period_ms = 10, counter = 1 }", "counter 1 is out of range"),

@@ -57,7 +57,7 @@ fn action() -> impl Strategy<Value = Action> {
     ];
     prop_oneof![
         (0_usize..4, request).prop_map(|(node, request)| Action::Nmt { node: NodeIndex(node), request }),
-        (0_usize..200).prop_map(|alarm| Action::Acknowledge { alarm: AlarmIndex(alarm) }),
+        (0_usize..200).prop_map(|alarm| Action::Acknowledge { alarm: AlarmIndex(alarm), raise: None }),
         (0_usize..200).prop_map(|alarm| Action::Reset { alarm: AlarmIndex(alarm) }),
         proptest::option::of(0_usize..4)
             .prop_map(|node| Action::AcknowledgeAll { node: node.map(NodeIndex) }),
@@ -81,8 +81,13 @@ fn step() -> impl Strategy<Value = Step> {
             ..BusCounters::default()
         },
     );
-    let health = (proptest::option::of(any::<bool>()), any::<bool>())
-        .prop_map(|(mqtt_connected, clock_synchronised)| Health { mqtt_connected, clock_synchronised });
+    let health = (proptest::option::of(any::<bool>()), any::<bool>()).prop_map(
+        |(mqtt_connected, clock_synchronised)| Health {
+            mqtt_connected,
+            clock_synchronised,
+            ..Health::default()
+        },
+    );
     prop_oneof![
         40 => frame().prop_map(Step::Frame),
         2 => link.prop_map(Step::Link),
@@ -122,13 +127,14 @@ fn nothing_old_is_good(conversation: &Conversation) {
             Source::Polled { .. }
             | Source::Adopted { .. }
             | Source::Rpdo { .. }
-            | Source::Emergency { .. } => {
+            | Source::Emergency { .. }
+            | Source::Module { .. } => {
                 unreachable!("a DetCon knows no SDO, no RPDO and no emergency messages")
             }
             Source::Pdo { pdo, .. } => {
                 let down = matches!(bus, BusState::Absent | BusState::Down | BusState::BusOff);
                 assert!(!sample.quality.is_good() || !down, "{} is good though its bus is {bus:?}", def.name);
-                let timeout = node.canopen.pdos[*pdo].timeout.unwrap();
+                let timeout = node.pdos()[*pdo].timeout.unwrap();
                 if sample.quality.is_usable() {
                     let age = now.since(sample.received_at.expect("a usable value was received"));
                     assert!(age <= timeout, "{} is {} after {age:?}", def.name, sample.quality);

@@ -155,7 +155,7 @@ fn v_dst_15_r_dst_017_entries_that_are_left_over_are_set_to_zero() {
 #[test]
 fn r_dst_018_019_what_the_shipped_mapping_asks_for_the_device_can_map() {
     let table = table(1, "", |_| ());
-    let setup = table.nodes[0].canopen.boot.setup_of(PdoIndex(0)).unwrap();
+    let setup = table.nodes[0].protocol.boot().unwrap().setup_of(PdoIndex(0)).unwrap();
     let maps: Vec<(u32, u32)> =
         setup.maps.iter().map(|object| (object.entry() >> 8, object.entry() & 0xFF)).collect();
     assert!(
@@ -224,7 +224,7 @@ fn r_dst_050_a_tpdo_that_no_longer_comes_makes_its_values_stale_after_three_even
         let mapping = format!(
             "[tpdo.1]\ncob_id = '$NODEID+0x180'\nmaps = ['0x6130:1/32']\nevent_timer_ms = {timer}\ntransmission_type = 255\n"
         );
-        table(1, &mapping, |_| ()).nodes[0].canopen.pdos[0].timeout.map(|timeout| timeout.as_millis())
+        table(1, &mapping, |_| ()).nodes[0].pdos()[0].timeout.map(|timeout| timeout.as_millis())
     };
     assert_eq!((timeout(100), timeout(0)), (Some(300), None));
 }
@@ -292,7 +292,7 @@ fn r_dst_063_guarding_is_refused_for_a_device_that_sends_heartbeats() {
     let problems = Sketch::new().node("press", 1, "danfoss-dst-p92c", entry).build().unwrap_err();
     let told: Vec<String> = problems.iter().map(ToString::to_string).collect();
     assert!(told.iter().any(|line| line.contains("cannot be guarded as well")), "{told:#?}");
-    let kind = table(1, "", |_| ()).nodes[0].canopen.error_control.clone();
+    let kind = table(1, "", |_| ()).nodes[0].canopen().unwrap().error_control.clone();
     assert_eq!(format!("{kind:?}"), "Heartbeat { timeout: 3s }");
 }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use cangate::can::{BusEvent, BusIndex, CanFrame, Link};
 use cangate::canopen::NodeId;
-use cangate::gateway::{Gateway, Input};
+use cangate::gateway::{Action, Gateway, Input, Outcome};
 use cangate::mapping::installation::RoleWord;
 use cangate::mapping::{Sketch, SourceText, TagTable, check_mapping};
 use cangate::modbus::{ModbusSettings, RegisterMap};
@@ -261,14 +261,72 @@ fn a_unit_that_is_changed_in_a_running_device_is_noticed_within_ten_seconds() {
     assert_eq!(world.events("other_unit"), 1);
 }
 
+/// Objects with whole numbers beside 0x9130 of both channels; offset has no second channel.
+const WHOLE_NUMBERS: [(&str, &str); 11] = [
+    ("0x9124", "1"),
+    ("0x9133", "1"),
+    ("0x9133", "2"),
+    ("0x9134", "1"),
+    ("0x9134", "2"),
+    ("0x9135", "1"),
+    ("0x9135", "2"),
+    ("0x9148", "1"),
+    ("0x9148", "2"),
+    ("0x9149", "1"),
+    ("0x9149", "2"),
+];
+
 #[test]
-fn r_dst_038_other_whole_numbers_of_a_channel_have_its_unit_and_digits() {
-    let text = mapping(DEFAULT, (BAR, 3), (CELSIUS, 0))
-        + "[[tag]]\nname = \"pressure_span_end\"\nobject = \"0x9149:1\"\npoll_ms = 60000\ntype = \"i32\"\nunit = \"kPa\"\n\
-           unit_object = \"0x6131:1\"\ndigits_object = \"0x6132:1\"\n";
-    let world = world(&text);
-    assert_eq!(world.tag(2, "pressure_span_end").quality, Quality::Good);
-    assert!((world.number(2, "pressure_span_end") - 40_000.0).abs() < 1e-6);
+fn r_dst_034_a_unit_that_is_written_through_the_gateway_holds_at_once_and_one_that_another_writes_soon() {
+    let mut world = world(&mapping(DEFAULT, (BAR, 3), (CELSIUS, 0)));
+    let write = |object: &str, data: Vec<u8>| {
+        let object = object.parse().unwrap();
+        Action::SdoWrite { node: NodeIndex(0), object, data, timeout: None }
+    };
+    assert_eq!(world.ask(write("0x6131:1", PSI.to_le_bytes().to_vec())), Outcome::Done);
+    assert_eq!(unit(&world, "pressure"), "psi");
+    assert_eq!(world.ask(write("0x6132:1", vec![2])), Outcome::Done);
+    assert_eq!((world.events("unit_changed"), world.events("digits_changed")), (2, 2), "for each tag");
+    world.run_for(300);
+    assert!((world.number(2, "pressure_pa") - 1e7).abs() < 2e5, "{}", world.number(2, "pressure_pa"));
+    assert!(matches!(world.ask(write("0x6131:1", vec![1, 2, 3])), Outcome::Aborted(_)));
+    assert_eq!(unit(&world, "pressure"), "psi", "what the device refuses changes nothing");
+    // The read of the unit is due in 10 s; another master writes mbar before.
+    world.say("602#2331610100004EFD");
+    world.run_for(300);
+    assert_eq!(unit(&world, "pressure"), "mbar");
+}
+
+#[test]
+fn r_dst_038_other_whole_numbers_have_the_unit_and_digits_that_their_tags_name_and_none_are_assumed() {
+    let tags = WHOLE_NUMBERS.map(|(object, channel)| {
+        let tag = |name: &str, unit: &str| {
+            format!(
+                "[[tag]]\nname = \"{name}_{}_{channel}\"\nobject = \"{object}:{channel}\"\npoll_ms = 1000\ntype = \"i32\"\n\
+                 decimals = 3\n{unit}",
+                &object[2..]
+            )
+        };
+        let unit = if channel == "1" { "kPa" } else { "°C" };
+        let told = format!(
+            "unit = \"{unit}\"\nunit_object = \"0x6131:{channel}\"\ndigits_object = \"0x6132:{channel}\"\n"
+        );
+        tag("told", &told) + &tag("plain", "")
+    });
+    let world = world(&(mapping(DEFAULT, (BAR, 3), (CELSIUS, 2)) + &tags.concat()));
+    for (object, channel) in WHOLE_NUMBERS {
+        let name = |kind: &str| format!("{kind}_{}_{channel}", &object[2..]);
+        let (told, plain) = (world.tag(2, &name("told")), world.tag(2, &name("plain")));
+        assert_eq!((told.quality, plain.quality), (Quality::Good, Quality::Good), "{object}:{channel}");
+        assert_eq!(plain.raw, told.raw, "{object}:{channel}");
+        assert_eq!(plain.value, plain.raw, "{object}:{channel}");
+        // Thousandths of a bar as kPa, hundredths of a degree.
+        let per_count = if channel == "1" { 0.1 } else { 0.01 };
+        let wanted = told.raw.as_f64() * per_count;
+        assert!((told.value.as_f64() - wanted).abs() <= wanted.abs() * 1e-9, "{object}:{channel}: {told:?}");
+    }
+    assert!((world.number(2, "told_9149_1") - 40_000.0).abs() < 1e-6);
+    assert!(world.number(2, "told_9149_2") > 1.0);
 }
 
 #[test]

@@ -4,6 +4,8 @@
 //! [`AlarmList::handle_timeout`], for one instant at a time and causes first. So a cause that is told of in the same
 //! instant as its consequences suppresses them before they are raised, in whatever order they were told.
 
+mod carry;
+
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
@@ -56,6 +58,8 @@ pub struct AlarmList {
     groups: BTreeMap<u32, Group>,
     timers: BTreeSet<Timer>,
     transitions: VecDeque<Transition>,
+    /// A count rose that nobody asked for since; that of a suppressed alarm does so without a transition.
+    counted: bool,
     /// The latest moment heard of.
     now: Now,
 }
@@ -121,6 +125,7 @@ impl AlarmList {
             groups,
             timers: BTreeSet::new(),
             transitions: VecDeque::new(),
+            counted: false,
             now: Now::default(),
         }
     }
@@ -158,6 +163,14 @@ impl AlarmList {
         }
     }
 
+    /// What a condition is about became something else while it holds: an alarm that is raised shows that from now on, one
+    /// that waits for its on-delay when it is raised. `true` when the alarm shows something else than before.
+    pub fn set_value(&mut self, alarm: AlarmIndex, value: Value) -> bool {
+        let Some(alarm) = self.alarms.get_mut(alarm.0) else { return false };
+        alarm.value = Some(value);
+        alarm.machine.suppresses_others() && alarm.status.value.replace(value) != Some(value)
+    }
+
     /// An operator has seen the alarm.
     pub fn acknowledge(&mut self, now: Now, alarm: AlarmIndex) -> Result<(), AcknowledgeError> {
         self.handle_timeout(now);
@@ -193,6 +206,11 @@ impl AlarmList {
     pub fn poll_output(&mut self) -> Option<Transition> {
         self.settle(self.now.instant);
         self.transitions.pop_front()
+    }
+
+    /// Whether an alarm was counted since the last call: what [`status`](Self::status) says is other than before.
+    pub fn take_counted(&mut self) -> bool {
+        std::mem::take(&mut self.counted)
     }
 
     /// When `handle_timeout` is to be called at the latest.
@@ -245,6 +263,7 @@ impl AlarmList {
         let is_cause = alarm.machine.suppresses_others();
         if event == AlarmEvent::On && accepted {
             alarm.status.count = alarm.status.count.saturating_add(1);
+            self.counted = true;
             alarm.note_raise(at.instant);
             if let Some(timer) = alarm.delay.filter(|timer| alarm.chatters() && !timer.leads_to()) {
                 // The condition has ended already, before it was known that the alarm chatters.

@@ -127,6 +127,28 @@ fn the_value_that_raised_an_alarm_stays_with_it() {
 }
 
 #[test]
+fn a_value_that_takes_the_place_of_another_is_shown_while_the_condition_holds() {
+    let mut list = list([spec().delays(100, 500)]);
+    let alarm = AlarmIndex(0);
+    let shown = |list: &AlarmList| list.status(alarm).unwrap().value;
+    list.set_condition(at(0), alarm, true, Some(Value::Unsigned(1)));
+    assert!(!list.set_value(alarm, Value::Unsigned(2)), "it is not raised yet");
+    run(&mut list, 100);
+    assert_eq!(shown(&list), Some(Value::Unsigned(2)));
+    assert!(list.set_value(alarm, Value::Unsigned(3)));
+    assert!(!list.set_value(alarm, Value::Unsigned(3)), "no news");
+    set(&mut list, 200, 0, false);
+    run(&mut list, 700);
+    assert_eq!(shown(&list), Some(Value::Unsigned(3)), "what was there last");
+    list.set_condition(at(800), alarm, true, Some(Value::Unsigned(4)));
+    assert!(!list.set_value(alarm, Value::Unsigned(4)));
+    assert_eq!(shown(&list), Some(Value::Unsigned(3)), "until it is raised again");
+    run(&mut list, 900);
+    assert_eq!(shown(&list), Some(Value::Unsigned(4)));
+    assert!(!list.set_value(AlarmIndex(7), Value::Unsigned(1)), "there is no such alarm");
+}
+
+#[test]
 fn an_alarm_that_is_raised_without_a_value_shows_none_of_the_time_before() {
     let mut list = list([spec()]);
     list.set_condition(at(0), AlarmIndex(0), true, Some(Value::Unsigned(1)));
@@ -241,6 +263,22 @@ fn a_suppressed_alarm_counts() {
     }
     assert_eq!(changes(&mut list).len(), 7);
     assert_eq!(list.status(AlarmIndex(1)).unwrap().count, 3);
+}
+
+#[test]
+fn what_a_suppressed_alarm_counts_is_told_though_nothing_else_of_it_changes() {
+    let mut list = chain();
+    set(&mut list, 0, 0, true);
+    set(&mut list, 0, 1, true);
+    run(&mut list, 1);
+    assert!(list.take_counted() && !list.take_counted());
+    set(&mut list, 2, 1, false);
+    run(&mut list, 3);
+    assert!(!list.take_counted());
+    set(&mut list, 4, 1, true);
+    run(&mut list, 5);
+    let status = list.status(AlarmIndex(1)).unwrap();
+    assert_eq!((status.state, status.count, list.take_counted()), (AlarmState::Suppressed, 2, true));
 }
 
 #[test]

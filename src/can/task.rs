@@ -83,8 +83,10 @@ pub async fn run_with<R: BusReader, W: BusWriter>(
     let desk = Desk { bus, name, listen_only, events, clock, state: Mutex::default() };
     let writer = tokio::sync::Mutex::new(None);
     tokio::select! {
-        Err(GatewayGone) = read_for_ever(&desk, &writer, open, longest_wait) => {}
+        // First what is to be sent: a gateway that has gone may have left something.
+        biased;
         _ = write_for_ever(&desk, &writer, transmit) => {}
+        Err(GatewayGone) = read_for_ever(&desk, &writer, open, longest_wait) => {}
         () = stop.cancelled() => {}
     }
 }

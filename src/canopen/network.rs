@@ -1,11 +1,13 @@
 //! All nodes of one bus.
 
+mod exchange;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use super::broadcasts::Broadcasts;
 use super::lss;
-use super::node::{Node, SdoRefused, predefined_tpdo};
+use super::node::{Moved, Node, SdoRefused, predefined_tpdo};
 use super::outputs::Outputs;
 use super::sdo::{SdoRequest, TransferId, request_id};
 use super::{
@@ -71,6 +73,18 @@ impl Slot {
             | Self::SdoRequest(node)
             | Self::Pdo(node, _) => Some(node),
         }
+    }
+
+    /// The same of the node at this place; `None` for what is of no node.
+    fn at(self, node: usize) -> Option<Self> {
+        Some(match self {
+            Self::Unknown | Self::Sync | Self::Time => return None,
+            Self::ErrorControl(_) => Self::ErrorControl(node),
+            Self::Emergency(_) => Self::Emergency(node),
+            Self::SdoAnswer(_) => Self::SdoAnswer(node),
+            Self::SdoRequest(_) => Self::SdoRequest(node),
+            Self::Pdo(_, pdo) => Self::Pdo(node, pdo),
+        })
     }
 }
 
@@ -157,8 +171,8 @@ impl Network {
             (Slot::ErrorControl(_), Some(node)) => node.handle_error_control(at, frame, outputs),
             (Slot::Emergency(_), Some(node)) => node.handle_emergency(at, frame, outputs),
             (Slot::Pdo(_, pdo), Some(node)) => {
-                node.handle_pdo(at, pdo, frame, outputs);
-                if let Some(after) = self.broadcasts.outside_window(at).filter(|_| node.is_synchronous(pdo)) {
+                let counts = node.handle_pdo(at, pdo, frame, outputs) && node.is_synchronous(pdo);
+                if let Some(after) = self.broadcasts.outside_window(at).filter(|_| counts) {
                     outputs.node(node.id, NodeEvent::PdoOutsideWindow { pdo, after });
                 }
                 false
@@ -169,6 +183,7 @@ impl Network {
             }
             (Slot::SdoRequest(_), Some(node)) => {
                 node.handle_foreign_sdo(at, frame, outputs);
+                self.next = earlier(self.next, node.poll_timeout());
                 return;
             }
             (Slot::Unknown | Slot::Sync | Slot::Time, _) | (_, None) => {
@@ -189,7 +204,7 @@ impl Network {
         let moved = node.as_mut().map(|node| node.take_moved()).unwrap_or_default();
         self.next = earlier(self.next, node.and_then(|node| node.poll_timeout()));
         if let Some(place) = slot.node() {
-            self.move_pdos(place, &moved);
+            self.move_ids(place, &moved);
         }
         if let Some(place) = slot.node().filter(|_| start && self.link_up) {
             self.start(at, place);
@@ -207,7 +222,8 @@ impl Network {
             && let Some(request) = NmtRequest::from_code(command)
         {
             for node in self.nodes.iter_mut().filter(|each| node == 0 || each.id.get() == node) {
-                node.command_not_sent(now.instant, request);
+                node.command_not_sent(now.instant, request, &mut self.outputs);
+                node.drive_rpdos(now.instant, &mut self.outputs);
             }
         } else {
             let outputs = &mut self.outputs;
@@ -279,7 +295,7 @@ impl Network {
     }
 
     /// Reads or writes an object of a node. If it is taken, [`NodeEvent::Sdo`] with this id will
-    /// follow, in bounded time. The highest bit of ids belongs to the boot of nodes.
+    /// follow, in bounded time. The three highest bits of ids, 61 to 63, belong to what the network asks by itself.
     pub fn request_sdo(
         &mut self,
         now: Now,
@@ -316,7 +332,7 @@ impl Network {
             let start = node.handle_timeout(at, &mut self.outputs);
             node.drive_rpdos(at, &mut self.outputs);
             let moved = node.take_moved();
-            self.move_pdos(place, &moved);
+            self.move_ids(place, &moved);
             if start {
                 self.start(at, place);
             }
@@ -362,10 +378,14 @@ impl Network {
         }
     }
 
-    /// TPDOs of a node have other identifiers than before (R-DST-119). One that is somebody else's stays so.
-    fn move_pdos(&mut self, place: usize, moved: &[(PdoIndex, Option<CanId>)]) {
-        for (pdo, id) in moved {
-            let slot = Slot::Pdo(place, *pdo);
+    /// TPDOs of a node, or its emergency messages, have other identifiers than before (R-DST-119). One that is somebody
+    /// else's stays so.
+    fn move_ids(&mut self, place: usize, moved: &[(Moved, Option<CanId>)]) {
+        for (what, id) in moved {
+            let slot = match what {
+                Moved::Pdo(pdo) => Slot::Pdo(place, *pdo),
+                Moved::Emergency => Slot::Emergency(place),
+            };
             if id.is_some_and(|id| self.slot(id) == slot) {
                 continue;
             }
@@ -399,6 +419,7 @@ impl Network {
             let Some(request) = NmtRequest::from_code(command) else { return };
             for each in self.nodes.iter_mut().filter(|each| node == 0 || each.id.get() == node) {
                 each.handle_foreign_command(now, request, &mut self.outputs);
+                each.drive_rpdos(now, &mut self.outputs);
             }
             self.look_ahead();
         } else if id == lss::REQUEST_ID && !frame.is_remote() {
@@ -449,6 +470,13 @@ impl Network {
         if let Some(place) = place.filter(|place| **place == Slot::Unknown) {
             *place = slot;
         }
+    }
+
+    /// All identifiers that are somebody's.
+    fn claimed(&self) -> impl Iterator<Item = (CanId, Slot)> {
+        let standard = (0..).map(CanId::Standard).zip(self.standard.iter().copied());
+        let extended = self.extended.iter().map(|(id, slot)| (CanId::Extended(*id), *slot));
+        standard.chain(extended).filter(|(_, slot)| *slot != Slot::Unknown)
     }
 
     fn look_ahead(&mut self) {

@@ -132,8 +132,11 @@ impl Rpdos {
         let running = self.running;
         let rpdo = self.rpdos.get_mut(place)?;
         rpdo.changed = true;
-        if rpdo.is_ready(running) && rpdo.settings.trigger == RpdoTrigger::Event {
-            rpdo.due = Some(now + RETRY);
+        match rpdo.settings.trigger {
+            // It follows the next SYNC, however many it waits for as a rule.
+            RpdoTrigger::Sync(every) => rpdo.syncs = every,
+            RpdoTrigger::Event if rpdo.is_ready(running) => rpdo.due = Some(now + RETRY),
+            RpdoTrigger::Event => {}
         }
         Some(RpdoIndex(place))
     }
@@ -149,11 +152,12 @@ impl Rpdo {
         running && self.agreed && self.data.is_some()
     }
 
-    /// When it is due: a change as soon as the inhibit time allows, the same again after the refresh time. After a SYNC
+    /// When it is due: a change as soon as the inhibit time allows, the same again after the refresh time, but no sooner. After a SYNC
     /// nothing is planned before that comes.
     fn plan(&mut self, now: Instant, running: bool) {
         let earliest = self.sent.map_or(now, |sent| now.max(sent + self.settings.inhibit));
-        let refresh = self.settings.refresh.zip(self.sent).map(|(refresh, sent)| (sent + refresh).max(now));
+        let refresh = self.settings.refresh.map(|refresh| refresh.max(self.settings.inhibit));
+        let refresh = refresh.zip(self.sent).map(|(refresh, sent)| (sent + refresh).max(now));
         self.due = match self.settings.trigger {
             _ if !self.is_ready(running) => None,
             RpdoTrigger::Sync(_) => None,
@@ -226,6 +230,33 @@ mod tests {
         assert_eq!(run(&mut rpdos, 60_000), ["40 201#2200"], "the last one is not lost");
         set(&mut rpdos, 70_000, 34);
         assert_eq!(run(&mut rpdos, 80_000), Vec::<String>::new(), "no change, no frame");
+    }
+
+    #[test]
+    fn the_same_is_not_sent_again_faster_than_the_inhibit_time() {
+        let mut rpdos = one(RpdoTrigger::Event, Some(4));
+        set(&mut rpdos, 0, 1);
+        rpdos.set_running(at(0), true);
+        assert_eq!(run(&mut rpdos, 25), ["0 201#0100", "10 201#0100", "20 201#0100"]);
+    }
+
+    #[test]
+    fn a_synchronous_one_that_did_not_leave_follows_the_next_sync() {
+        for every in [0, 5] {
+            let mut rpdos = one(RpdoTrigger::Sync(every), None);
+            rpdos.set_running(at(0), true);
+            set(&mut rpdos, 0, 1);
+            let mut syncs = 1..=20_u64;
+            let mut next = |rpdos: &mut Rpdos| {
+                syncs.find_map(|sync| {
+                    rpdos.handle_sync(at(100 * sync));
+                    rpdos.take_due(at(100 * sync)).map(|sent| (sync, sent.frame))
+                })
+            };
+            let (sync, frame) = next(&mut rpdos).unwrap();
+            rpdos.handle_not_sent(at(100 * sync + 1), &frame);
+            assert_eq!(next(&mut rpdos), Some((sync + 1, frame)), "type {every}");
+        }
     }
 
     #[test]

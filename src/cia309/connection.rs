@@ -4,13 +4,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio_util::sync::CancellationToken;
 
 use super::lines::{LONGEST_LINE, Lines, TooLong};
 use super::session::{Session, Step};
-use crate::gateway::command::{CommandSource, Desk};
+use crate::gateway::command::{Authority, CommandSource, Desk};
 use crate::mapping::TagTable;
-use crate::slots::Activity;
+use crate::slots::{Leave, Place};
 use crate::time::Clock;
 
 /// What all connections share.
@@ -28,38 +27,25 @@ pub struct Shared {
     pub idle_timeout: Option<Duration>,
 }
 
-/// What ends a connection from outside.
-#[derive(Clone, Debug)]
-pub struct Stops {
-    /// It has to make room.
-    pub evict: CancellationToken,
-    /// The gateway stops.
-    pub stop: CancellationToken,
-}
-
 /// Bytes that are read at once. While a line is being answered nothing more is read, so that a client that sends without end
 /// waits in its own buffers.
 const INPUT: usize = 2_048;
 /// A client must take an answer within this.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Serves a client until it, the network, a time-out or one of `stops` ends it; why is for the log.
-pub async fn serve<S>(
-    stream: S,
-    peer: String,
-    shared: &Shared,
-    activity: &Activity,
-    stops: &Stops,
-) -> &'static str
+/// Serves a client until it, the network or a time-out ends it, or its place is wanted; why is for the log.
+pub async fn serve<S>(stream: S, peer: String, shared: &Shared, place: &Place) -> &'static str
 where
     S: AsyncReadExt + AsyncWriteExt + Unpin,
 {
     let session = Session::new(Arc::clone(&shared.table), shared.writes);
-    let mut connection = Connection { stream, peer, shared, activity, session, lines: Lines::default() };
+    let mut connection = Connection { stream, peer, shared, place, session, lines: Lines::default() };
     tokio::select! {
         end = connection.run() => end,
-        () = stops.evict.cancelled() => "evicted",
-        () = stops.stop.cancelled() => "stopped",
+        leave = place.must_leave() => match leave {
+            Leave::Evicted => "evicted",
+            Leave::Stopped => "stopped",
+        },
     }
 }
 
@@ -67,7 +53,7 @@ struct Connection<'a, S> {
     stream: S,
     peer: String,
     shared: &'a Shared,
-    activity: &'a Activity,
+    place: &'a Place,
     session: Session,
     lines: Lines,
 }
@@ -103,20 +89,42 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
     }
 
     /// Answers all lines that are complete. Whether there was one.
+    ///
+    /// A line that is too long is the last one: it could be the beginning of an HTTP request with a very long address, which a
+    /// web page made the browser of somebody in the plant send, and what follows it would be of that page's choice.
     async fn work_off(&mut self) -> Result<bool, &'static str> {
         let mut any = false;
         while let Some(line) = self.lines.next_line() {
             any = true;
-            self.activity.touch(self.shared.clock.now().instant);
             let answer = match line {
-                Err(TooLong) => Session::too_long(LONGEST_LINE),
+                Err(TooLong) => {
+                    self.send(Session::too_long(LONGEST_LINE)).await?;
+                    return Err("too_long");
+                }
                 Ok(line) => match self.session.handle_line(line) {
                     Step::Nothing => continue,
                     Step::End => return Err("http"),
-                    Step::Answer(text) => text,
+                    Step::Last(text) => {
+                        self.send(text).await?;
+                        return Err("no_text");
+                    }
+                    // Who asks for nothing that is known keeps nobody else out.
+                    Step::NotUnderstood(text) => text,
+                    Step::Answer(text) => {
+                        self.place.touch(self.shared.clock.now().instant);
+                        text
+                    }
+                    Step::Refused(text, told) => {
+                        self.place.touch(self.shared.clock.now().instant);
+                        let source = CommandSource::cia309(self.peer.clone());
+                        self.shared.desk.refuse(source, told.verb, told.text);
+                        text
+                    }
                     Step::Ask(action, asked) => {
-                        let source = CommandSource::Cia309(self.peer.clone());
-                        asked.answer(&self.shared.desk.ask(source, action).await)
+                        self.place.touch(self.shared.clock.now().instant);
+                        let source = CommandSource::cia309(self.peer.clone());
+                        let opened = Authority::Objects { write: self.shared.writes };
+                        asked.answer(&self.shared.desk.ask(source, &opened, action).await)
                     }
                 },
             };

@@ -9,10 +9,10 @@
 //! | `vs` | `"a text"`, a quote in it doubled; what is no printable ASCII or Latin-1 as `\x1B`, a backslash as `\\` |
 //! | `os`, `us`, `d` | base64; `""` for nothing |
 //! | `t`, `td` | days and milliseconds: `365 43200000` |
-//! | `hex` | `9A C5 00 00`: the bytes as they come; not in the standard. A read without a type is shown so |
+//! | `hex` | `9A C5 00 00`, `""` for nothing: the bytes as they come; not in the standard. A read without a type is shown so |
 
-use super::base64;
 use super::words::Word;
+use crate::base64;
 use crate::canopen::object::DataType;
 
 /// How the bytes of an object are written.
@@ -84,6 +84,8 @@ impl Format {
     #[must_use]
     pub fn read(self, words: &[Word]) -> Option<Vec<u8>> {
         match self {
+            // No bytes are `""`, as for `os`; a value that was forgotten is not taken for that.
+            Self::Bytes if words.is_empty() => None,
             Self::Bytes => {
                 let texts = words.iter().map(Word::text);
                 DataType::OctetString.encode(&texts.collect::<Vec<_>>().join(" ")).ok()
@@ -202,6 +204,7 @@ mod tests {
         assert_eq!(read("x16", "1000"), Some(vec![0xE8, 0x03]));
         assert_eq!(read("vs", "word"), Some(b"word".to_vec()));
         assert_eq!(read("hex", "9ac5 00"), Some(vec![0x9A, 0xC5, 0]));
+        assert_eq!(read("hex", "\"\""), Some(vec![]));
         assert_eq!(read("r32", "inf"), Some(f32::INFINITY.to_le_bytes().to_vec()));
     }
 
@@ -224,6 +227,7 @@ mod tests {
             ("t", "1 2 3"),
             ("t", "65536 0"),
             ("hex", "ABC"),
+            ("hex", ""),
             ("x8", "0x100"),
         ] {
             assert_eq!(read(word, text), None, "{word} {text}");

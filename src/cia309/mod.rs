@@ -10,14 +10,13 @@
 //! Pure:
 //! - [`settings`]: the `[cia309]` table.
 //! - [`lines`]: lines out of a stream of bytes, of bounded length.
-//! - [`request`]: what a line asks for. [`words`]: its words. [`format`](mod@format): values as text. `base64`: bytes as text.
+//! - [`request`]: what a line asks for. [`words`]: its words. [`format`](mod@format): values as text.
 //! - [`code`]: the error codes.
 //! - [`session`]: what is remembered between lines; from a request to what is asked of the gateway, and back.
 //!
 //! On the network:
-//! - [`server`] \[IO\]: listens, accepts, limits. [`connection`] \[IO\]: one client.
+//! - [`server`] \[IO\]: listens. [`connection`] \[IO\]: one client.
 
-mod base64;
 pub mod code;
 pub mod connection;
 pub mod format;
@@ -28,8 +27,8 @@ pub mod session;
 pub mod settings;
 pub mod words;
 
-pub use server::{BindError, Server};
-pub use session::{Session, Step};
+pub use server::Server;
+pub use session::{Session, Step, Told};
 pub use settings::Cia309Settings;
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
 //! What a line asks for.
 
+use std::fmt;
 use std::time::Duration;
 
 use super::code::{Code, Refusal};
@@ -64,6 +65,22 @@ pub enum Request {
     Version,
 }
 
+impl Request {
+    /// Where it is to change something: its word in the journal, and what it asks for.
+    #[must_use]
+    pub fn command(&self) -> Option<(&'static str, String)> {
+        match self {
+            Self::Write { target, object, .. } => Some(("sdo_write", format!("{object}{target}"))),
+            Self::Nmt { target, request } => Some(("nmt", format!("{request:?}{target}"))),
+            Self::Read { .. }
+            | Self::SetNetwork(_)
+            | Self::SetNode { .. }
+            | Self::SetSdoTimeout { .. }
+            | Self::Version => None,
+        }
+    }
+}
+
 /// Whom a request is for, as far as the line says so.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Target {
@@ -71,6 +88,14 @@ pub struct Target {
     pub network: Option<u16>,
     /// The node id.
     pub node: Option<u8>,
+}
+
+impl fmt::Display for Target {
+    /// ` of node 2 in network 1`, as far as it is said.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.node.map_or(Ok(()), |node| write!(f, " of node {node}"))?;
+        self.network.map_or(Ok(()), |network| write!(f, " in network {network}"))
+    }
 }
 
 /// SDO time-outs that are taken, in ms. A longer one would hold up everybody else who asks the same node.

@@ -1,16 +1,13 @@
-//! Listens, accepts, limits. \[IO\]
+//! Listens. \[IO\]
 
-use std::io;
 use std::net::SocketAddr;
-use std::time::Duration;
+use std::sync::Arc;
 
-use nix::sys::socket::{setsockopt, sockopt};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::task::{JoinError, JoinSet};
 use tokio_util::sync::CancellationToken;
 
-use super::connection::{self, Shared, Stops};
-use crate::slots::{SlotId, Slots};
+use super::connection::{self, Shared};
+use crate::slots::{BindError, Clients, Limits, Place, ServerName, Service, listening};
 
 /// A CiA 309-3 gateway that listens already.
 #[derive(Debug)]
@@ -21,18 +18,9 @@ pub struct Server {
     shared: Shared,
 }
 
-/// An address could not be listened on.
-#[derive(Debug, thiserror::Error)]
-#[error("cannot listen for CiA 309-3 on {address}: {source}; change `listen` in [cia309]")]
-pub struct BindError {
-    /// The address.
-    pub address: SocketAddr,
-    /// What the system says.
-    pub source: io::Error,
+fn name() -> ServerName {
+    ServerName::new("CiA 309-3", "[cia309]")
 }
-
-/// Pause after a failed accept, for example when there are no file descriptors left.
-const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 impl Server {
     /// Listens.
@@ -40,9 +28,8 @@ impl Server {
     /// # Errors
     /// The address cannot be listened on.
     pub async fn bind(address: SocketAddr, max_connections: u16, shared: Shared) -> Result<Self, BindError> {
-        let failed = |source| BindError { address, source };
-        let listener = TcpListener::bind(address).await.map_err(failed)?;
-        let address = listener.local_addr().map_err(failed)?;
+        let listener = listening::bind(&name(), address).await?;
+        let address = listener.local_addr().unwrap_or(address);
         Ok(Self { listener, address, max_connections: max_connections.into(), shared })
     }
 
@@ -54,88 +41,13 @@ impl Server {
 
     /// Serves until `stop`. Connections end with it.
     pub async fn run(self, stop: CancellationToken) {
-        let mut clients = Clients {
-            slots: Slots::new(self.max_connections),
-            tasks: JoinSet::new(),
-            shared: self.shared,
-            stop,
-        };
-        let stop = clients.stop.clone();
-        loop {
-            tokio::select! {
-                () = stop.cancelled() => break,
-                accepted = self.listener.accept() => match accepted {
-                    Ok((stream, peer)) => clients.admit(stream, peer).await,
-                    Err(error) => {
-                        tracing::debug!(%error, "cannot accept a CiA 309-3 connection for now");
-                        tokio::time::sleep(ACCEPT_PAUSE).await;
-                    }
-                },
-                Some(ended) = clients.tasks.join_next() => clients.ended(ended),
-            }
-        }
-        while let Some(ended) = clients.tasks.join_next().await {
-            clients.ended(ended);
-        }
+        let clients = Clients::new(name(), Limits::places(self.max_connections), stop);
+        listening::serve(vec![self.listener], clients, Arc::new(self.shared)).await;
     }
 }
 
-/// The connections that are open.
-struct Clients {
-    slots: Slots<CancellationToken>,
-    tasks: JoinSet<SlotId>,
-    shared: Shared,
-    stop: CancellationToken,
-}
-
-impl Clients {
-    /// Serves a newcomer; somebody else makes room if need be.
-    async fn admit(&mut self, stream: TcpStream, peer: SocketAddr) {
-        while let Some(ended) = self.tasks.try_join_next() {
-            self.ended(ended);
-        }
-        if let Err(error) = configure(&stream) {
-            tracing::debug!(%peer, %error, "CiA 309-3 connection was gone before it was served");
-            return;
-        }
-        let evict = CancellationToken::new();
-        let taken = self.slots.take(peer.ip(), evict.clone());
-        if let Some(other) = taken.evicted {
-            other.cancel();
-            // So that there are never more tasks than places.
-            while self.tasks.len() >= self.slots.in_use() {
-                let Some(ended) = self.tasks.join_next().await else { break };
-                self.ended(ended);
-            }
-        }
-        tracing::debug!(%peer, "CiA 309-3 connection opened");
-        let (shared, stops) = (self.shared.clone(), Stops { evict, stop: self.stop.clone() });
-        self.tasks.spawn(async move {
-            let end = connection::serve(stream, peer.to_string(), &shared, &taken.activity, &stops).await;
-            tracing::debug!(%peer, end, "CiA 309-3 connection ended");
-            taken.id
-        });
+impl Service for Shared {
+    async fn serve(&self, stream: TcpStream, peer: SocketAddr, place: Place) -> &'static str {
+        connection::serve(stream, peer.to_string(), self, &place).await
     }
-
-    fn ended(&mut self, ended: Result<SlotId, JoinError>) {
-        match ended {
-            Ok(id) => self.slots.release(id),
-            // A panic is our bug; it ends the server as it would in this task, and the supervisor tells.
-            Err(error) => {
-                if let Ok(panic) = error.try_into_panic() {
-                    std::panic::resume_unwind(panic);
-                }
-            }
-        }
-    }
-}
-
-/// Answers leave at once; a client that vanished is noticed after 25 s and not after two hours.
-fn configure(stream: &TcpStream) -> io::Result<()> {
-    stream.set_nodelay(true)?;
-    setsockopt(stream, sockopt::KeepAlive, &true)?;
-    setsockopt(stream, sockopt::TcpKeepIdle, &10)?;
-    setsockopt(stream, sockopt::TcpKeepInterval, &5)?;
-    setsockopt(stream, sockopt::TcpKeepCount, &3)?;
-    Ok(())
 }

@@ -28,11 +28,27 @@ pub enum Step {
     Nothing,
     /// This is the answer, without the end of the line.
     Answer(String),
+    /// This is the answer to a line that is not understood.
+    NotUnderstood(String),
+    /// This is the answer, and then the connection is to be closed: the line is no text. It could be the beginning of a hello
+    /// of TLS, and what follows it lines of the choice of a web page.
+    Last(String),
     /// The connection is to be closed: a browser is at the other end. A web page from anywhere can make the browser of somebody
     /// in the plant send lines of its choice here, in a request that begins with lines of HTTP.
     End,
     /// The gateway is to be asked; [`Asked::answer`] makes the answer of what comes of it.
     Ask(Action, Asked),
+    /// This is the answer to a command that cannot be asked for, and what is to be told of it.
+    Refused(String, Told),
+}
+
+/// A command that was refused.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Told {
+    /// Its word in the journal.
+    pub verb: &'static str,
+    /// What was asked for, and why it was refused.
+    pub text: String,
 }
 
 /// A line whose answer the gateway has to give.
@@ -58,13 +74,28 @@ impl Session {
         if is_http(line) {
             return Step::End;
         }
+        if !is_text(line) {
+            let refusal = Code::Syntax
+                .because("no text: a byte is not UTF-8, or a control character; the connection ends");
+            return Step::Last(answer(0, &refusal.to_string()));
+        }
         let Some(Line { sequence, request }) = parse(line) else { return Step::Nothing };
+        let command = request.as_ref().ok().and_then(Request::command);
         let done = request.and_then(|request| self.request(request));
         match done {
             Ok(Ask::Done) => Step::Answer(answer(sequence, "OK")),
             Ok(Ask::Tell(text)) => Step::Answer(answer(sequence, &text)),
             Ok(Ask::Gateway(action, format)) => Step::Ask(action, Asked { sequence, format }),
-            Err(refusal) => Step::Answer(answer(sequence, &refusal.to_string())),
+            Err(refusal) => {
+                let text = answer(sequence, &refusal.to_string());
+                match command {
+                    Some((verb, what)) => {
+                        Step::Refused(text, Told { verb, text: format!("{what}: {}", refusal.text) })
+                    }
+                    None if refusal.code == Code::Syntax => Step::NotUnderstood(text),
+                    None => Step::Answer(text),
+                }
+            }
         }
     }
 
@@ -139,7 +170,9 @@ impl Session {
             .or(self.network)
             .ok_or_else(|| Code::NoNetwork.because("name a network, or `set network` one"))?;
         let bus = usize::from(self.check_network(network)?) - 1;
-        let found = self.table.nodes.iter().position(|node| node.bus.0 == bus && node.canopen.id.get() == id);
+        let found = self.table.nodes.iter().position(|node| {
+            node.bus.0 == bus && node.canopen().is_some_and(|settings| settings.id.get() == id)
+        });
         found.map(NodeIndex).ok_or_else(|| {
             Code::UnknownNode.because(if id == 0 {
                 "all nodes at once is not offered".to_owned()
@@ -148,6 +181,12 @@ impl Session {
             })
         })
     }
+}
+
+/// UTF-8, and no control character but those between words and at the end.
+fn is_text(line: &[u8]) -> bool {
+    let letter = |letter: char| !letter.is_control() || matches!(letter, '\t' | '\r');
+    std::str::from_utf8(line).is_ok_and(|text| text.chars().all(letter))
 }
 
 /// The first line of an HTTP request: `POST / HTTP/1.1`.
@@ -177,6 +216,7 @@ impl Asked {
             }),
             Outcome::Unknown
             | Outcome::Rejected(_)
+            | Outcome::Forbidden(_)
             | Outcome::Busy
             | Outcome::NodeUnavailable
             | Outcome::Aborted(_)
@@ -197,7 +237,7 @@ fn refusal(outcome: &Outcome) -> Refusal {
         Outcome::NodeUnavailable => {
             Code::State.because("the node cannot take it now: its bus is down, or it is stopped")
         }
-        Outcome::Rejected(why) | Outcome::Failed(why) => {
+        Outcome::Rejected(why) | Outcome::Forbidden(why) | Outcome::Failed(why) => {
             Code::State.because(why.replace(char::is_control, " "))
         }
         Outcome::Unknown => Code::UnknownNode.because(""),

@@ -36,7 +36,9 @@ fn writer() -> Session {
 
 fn answer(session: &mut Session, line: &str) -> String {
     let step = session.handle_line(line.as_bytes());
-    let Step::Answer(text) = step else { panic!("{line}: {step:?}") };
+    let (Step::Answer(text) | Step::NotUnderstood(text) | Step::Refused(text, _)) = step else {
+        panic!("{line}: {step:?}")
+    };
     text
 }
 
@@ -234,8 +236,47 @@ fn what_is_not_understood_is_a_syntax_error_with_its_sequence_number() {
     for line in ["[", "[]", "[x] start", "[1", "[4294967296] start", "[-1] start", "hello", "]"] {
         assert_eq!(code(&mut writer(), line), "[0] ERROR:101", "{line}");
     }
-    let Step::Answer(text) = writer().handle_line(b"[1] \xFF") else { panic!() };
-    assert!(text.starts_with("[0] ERROR:101"), "{text}");
+}
+
+#[test]
+fn a_line_that_is_no_text_is_the_last_one() {
+    for line in
+        [b"[1] \xFF".as_slice(), b"\x16\x03\x01\x02", b"[1] 1 r 0x1018 1 u32\0", b"# \x1B", b"[1] 1 stop\x7F"]
+    {
+        let Step::Last(text) = writer().handle_line(line) else { panic!("{line:02x?}") };
+        assert!(text.starts_with("[0] ERROR:101"), "{text}");
+    }
+    assert!(matches!(reader().handle_line(b"\t[1]\t1 r 0x1018 1\r"), Step::Ask(..)));
+    assert!(matches!(reader().handle_line("[1] 1 # µ".as_bytes()), Step::NotUnderstood(_)));
+}
+
+#[test]
+fn commands_that_are_refused_are_told_with_what_was_asked_for_and_why() {
+    let told = |mut session: Session, line: &str| {
+        let Step::Refused(answer, told) = session.handle_line(line.as_bytes()) else { panic!("{line}") };
+        (answer, told.verb, told.text)
+    };
+    let (answer, verb, text) = told(reader(), "[7] 1 w 0x1017 0 u16 500");
+    assert!(answer.starts_with("[7] ERROR:100 "), "{answer}");
+    assert_eq!(verb, "sdo_write");
+    assert!(text.starts_with("0x1017:0 of node 1: writes and NMT commands are not enabled"), "{text}");
+    assert_eq!(told(reader(), "[8] 1 stop").1, "nmt");
+    let (_, verb, text) = told(writer(), "[9] 1 99 reset node");
+    assert_eq!(verb, "nmt");
+    assert!(text.starts_with("ResetNode of node 99 in network 1: no node 99"), "{text}");
+    // A read changes nothing.
+    assert!(matches!(writer().handle_line(b"[1] 99 r 0x1018 1"), Step::Answer(_)));
+}
+
+#[test]
+fn only_what_is_understood_keeps_a_place() {
+    for line in ["hello", "[4] 1 hello", "[x] start"] {
+        assert!(matches!(writer().handle_line(line.as_bytes()), Step::NotUnderstood(_)), "{line}");
+    }
+    assert!(matches!(writer().handle_line(b"[1] 9 start"), Step::Refused(..)));
+    for line in ["[1] set network 9", "[1] 1 init 0", "[1] info version"] {
+        assert!(matches!(writer().handle_line(line.as_bytes()), Step::Answer(_)), "{line}");
+    }
 }
 
 #[test]
@@ -344,7 +385,10 @@ fn a_hundred_thousand_lines_of_any_kind_are_answered_with_one_line_or_none() {
         for session in [&mut reading, &mut writing] {
             let answer = match session.handle_line(&line) {
                 Step::Nothing | Step::End => continue,
-                Step::Answer(text) => {
+                Step::Answer(text)
+                | Step::NotUnderstood(text)
+                | Step::Last(text)
+                | Step::Refused(text, _) => {
                     refused += u32::from(text.contains("ERROR:"));
                     text
                 }

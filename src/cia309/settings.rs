@@ -41,13 +41,15 @@ impl Cia309Settings {
         wrong.then(|| ("max_connections", message, "use 1 to 64".to_owned())).into_iter().collect()
     }
 
-    /// Whether others than this host can reach it, and what they can do then.
+    /// Whether others than this host can reach it, and what they can do then; with a hint.
     #[must_use]
-    pub fn warning(&self) -> Option<String> {
+    pub fn warning(&self) -> Option<(String, String)> {
         let listen = self.listen.filter(|listen| !listen.ip().is_loopback())?;
         let what = if self.writes { "read and change every device" } else { "read every object" };
-        Some(format!(
-            "whoever reaches {listen} can {what} without a login: let a firewall name the clients, or listen on 127.0.0.1"
+        let without = if self.writes { "; without `writes` nothing can be changed" } else { "" };
+        Some((
+            format!("whoever reaches {listen} can {what} without a login"),
+            format!("let a firewall name the clients, or listen on 127.0.0.1{without}"),
         ))
     }
 
@@ -77,7 +79,10 @@ mod tests {
         let warning = |text: &str| toml::from_str::<Cia309Settings>(text).unwrap().warning();
         assert_eq!(warning("listen = '127.0.0.1:60000'\nwrites = true"), None);
         assert_eq!(warning("listen = '[::1]:60000'"), None);
-        assert!(warning("listen = '0.0.0.0:60000'").unwrap().contains("read every object"));
-        assert!(warning("listen = '10.0.0.1:1'\nwrites = true").unwrap().contains("read and change"));
+        let (message, hint) = warning("listen = '0.0.0.0:60000'").unwrap();
+        assert!(message.contains("read every object"), "{message}");
+        assert!(!hint.contains("writes"), "they are off already: {hint}");
+        let (message, hint) = warning("listen = '10.0.0.1:1'\nwrites = true").unwrap();
+        assert!(message.contains("read and change") && hint.contains("without `writes`"), "{message} {hint}");
     }
 }

@@ -6,6 +6,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, ValueEnum};
 use clap_complete::Shell;
 
+use super::buffer::{parse_hours, parse_size};
+use super::esd_args::EsdArguments;
 use super::health::Url;
 use super::lss_args::LssArguments;
 use super::schema::Schema;
@@ -13,6 +15,8 @@ use super::tool_args::{InitArguments, NmtArguments, ScanArguments, SdoArguments}
 use crate::can::interface::Interface;
 use crate::config::DEFAULT_FILE;
 use crate::modbus::MapFormat;
+use crate::simulator::DeviceNumber;
+use crate::simulator::serial_place::SerialPlace;
 use crate::telemetry::{DEFAULT_FILTER, LogFormat};
 
 /// A CANopen gateway to Modbus TCP and MQTT that tells stale values from live ones.
@@ -45,6 +49,8 @@ pub enum Subcommand {
     Map(MapArguments),
     /// Make a device mapping from an EDS or DCF, or update one.
     Import(ImportArguments),
+    /// Write the DCF of nodes: their EDS with what this configuration sets them to.
+    Dcf(DcfArguments),
     /// Put a simulated device on an interface.
     Sim(SimArguments),
     /// Run a candump log through the gateway; the same log gives the same output, always.
@@ -55,8 +61,12 @@ pub enum Subcommand {
     Completions(CompletionsArguments),
     /// Print the manual page, or write one for each command.
     Man(ManArguments),
+    /// Plan how much room is needed for what is kept while the broker is away.
+    Buffer(BufferArguments),
     /// Ask the gateway on this host whether it is ready; exit code 1 when it is not. For containers and watchdogs.
     Health(HealthArguments),
+    /// Make the hash of a password, for `password` in [access.NAME]. It is asked for, or read from standard input.
+    Password,
     /// Tell who is on a bus. Without --active NOTHING is sent, not one frame; where the controller can, not even
     /// acknowledges.
     Scan(ScanArguments),
@@ -68,6 +78,8 @@ pub enum Subcommand {
     Sdo(SdoArguments),
     /// Find devices by their LSS address, give them node ids and bit rates.
     Lss(LssArguments),
+    /// Find, show and command esd modules: CAN-CBM-SIO1 and SIO4.
+    Esd(EsdArguments),
 }
 
 /// `cangate run`
@@ -76,6 +88,14 @@ pub struct RunArguments {
     /// The configuration file.
     #[arg(short, long, default_value = DEFAULT_FILE, value_name = "FILE")]
     pub config: PathBuf,
+    /// Folder for a copy of the last good configuration, which is started where the file is bad. Without it: /var/lib/cangate,
+    /// where that is there and can be written to.
+    #[arg(long, env = "CANGATE_STATE_DIR", value_name = "FOLDER")]
+    pub state_dir: Option<PathBuf>,
+    /// Let a reload change what stands at published Modbus addresses and topics; as `allow_map_change` under `[gateway]`, but
+    /// for every reload of this run.
+    #[arg(long)]
+    pub allow_map_change: bool,
 }
 
 /// `cangate demo`
@@ -93,6 +113,18 @@ pub struct DemoArguments {
     /// Where the status page listens.
     #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS")]
     pub http: SocketAddr,
+    /// Where the first of the three serial lines listens; the others take the next ports.
+    #[arg(long, default_value = "127.0.0.1:4001", value_name = "ADDRESS", value_parser = first_of_three)]
+    pub serial: SocketAddr,
+}
+
+/// An address with two more ports above its own; port 0 takes any three.
+fn first_of_three(text: &str) -> Result<SocketAddr, String> {
+    let address: SocketAddr = text.parse().map_err(|error| format!("{error}; give IP:PORT"))?;
+    match address.port().checked_add(2) {
+        Some(_) => Ok(address),
+        None => Err("three ports are needed: 65533 is the highest for the first".to_owned()),
+    }
 }
 
 /// `cangate check`
@@ -101,6 +133,10 @@ pub struct CheckArguments {
     /// Configuration and mapping files.
     #[arg(required = true, value_name = "FILE")]
     pub files: Vec<PathBuf>,
+    /// The configuration that runs: print what a reload would change to go from it to the one FILE. Exit code 1 where the reload
+    /// would be refused because published addresses change.
+    #[arg(long, value_name = "RUNNING")]
+    pub against: Option<PathBuf>,
 }
 
 /// `cangate map`
@@ -113,6 +149,10 @@ pub struct MapArguments {
     /// The configuration file.
     #[arg(short, long, default_value = DEFAULT_FILE, value_name = "FILE")]
     pub config: PathBuf,
+    /// Instead of the map: every frame that this configuration lets the gateway send on CAN, whom it is for, why, and how often
+    /// at most. Anything else cannot leave. As table, csv or json.
+    #[arg(long)]
+    pub frames: bool,
     /// How the map is written.
     #[arg(long, value_enum, default_value_t)]
     pub format: MapFormat,
@@ -140,12 +180,33 @@ pub enum MapCommand {
 /// `cangate import`
 #[derive(Args, Debug)]
 pub struct ImportArguments {
-    /// The EDS or DCF.
+    /// The EDS or DCF; with --list a folder of them.
     #[arg(value_name = "FILE")]
     pub file: PathBuf,
     /// Where to; standard output without it. A file of a former import is updated: its names, addresses and what was
     /// written by hand stay.
     #[arg(short, long, value_name = "FILE")]
+    pub output: Option<PathBuf>,
+    /// Import nothing: print of which devices the EDS and DCF files of this folder are.
+    #[arg(long, conflicts_with = "output")]
+    pub list: bool,
+}
+
+/// `cangate dcf`
+#[derive(Args, Debug)]
+pub struct DcfArguments {
+    /// Names of nodes of the configuration; all without them.
+    #[arg(value_name = "NODE")]
+    pub nodes: Vec<String>,
+    /// The configuration file.
+    #[arg(short, long, default_value = DEFAULT_FILE, value_name = "FILE")]
+    pub config: PathBuf,
+    /// An EDS, or a folder in which the one of each device is found by maker and product. May be given several times.
+    #[arg(long, required = true, value_name = "PATH")]
+    pub eds: Vec<PathBuf>,
+    /// Folder for the DCFs, each called after its node, which replace those that are there. Without it the DCF of one node goes
+    /// to standard output.
+    #[arg(short, long, value_name = "FOLDER")]
     pub output: Option<PathBuf>,
 }
 
@@ -158,12 +219,16 @@ pub struct SimArguments {
     /// The interface, for example `vcan0`.
     #[arg(short, long)]
     pub interface: Interface,
-    /// Its CANopen node id, 1 to 127.
-    #[arg(long, value_parser = clap::value_parser!(u8).range(1..=127))]
-    pub node: u8,
-    /// How many devices, on node ids that follow each other.
+    /// Its CANopen node id, 1 to 127; of an esd module its coding switches, 1 to 0xCC (SIO1) or 0xCB (SIO4).
+    #[arg(long)]
+    pub node: DeviceNumber,
+    /// How many devices, on numbers that follow each other.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=127))]
     pub count: u8,
+    /// Puts a serial channel of an esd module to where programs find it: `1=pty:/tmp/ttyS1`, or `2=tcp:127.0.0.1:7001`. Can be
+    /// given for each channel.
+    #[arg(long, value_name = "CHANNEL=PLACE")]
+    pub serial: Vec<SerialPlace>,
     /// A scenario file, or the name of a shipped one (see docs/simulator.md).
     #[arg(long, value_name = "FILE")]
     pub scenario: Option<String>,
@@ -180,6 +245,12 @@ pub enum SimDevice {
     /// Danfoss DST P92C pressure transmitter.
     #[value(name = "dst-p92c")]
     DstP92c,
+    /// esd CAN-CBM-SIO1, a serial line behind CAN.
+    #[value(name = "cbm-sio1")]
+    CbmSio1,
+    /// esd CAN-CBM-SIO4, five serial lines behind CAN.
+    #[value(name = "cbm-sio4")]
+    CbmSio4,
 }
 
 /// `cangate replay`
@@ -229,4 +300,34 @@ pub struct HealthArguments {
     /// The configuration file [default: /etc/cangate/cangate.toml, or 127.0.0.1:8080 where that does not exist].
     #[arg(short, long, value_name = "FILE", conflicts_with = "url")]
     pub config: Option<PathBuf>,
+}
+
+/// `cangate buffer`
+#[derive(Args, Debug)]
+pub struct BufferArguments {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: BufferCommand,
+}
+
+/// `cangate buffer ...`
+#[derive(Debug, clap::Subcommand)]
+pub enum BufferCommand {
+    /// How many hours the room for what is kept on disk lasts while the broker is away, or how much room so many hours need,
+    /// with the configured nodes.
+    Plan(PlanArguments),
+}
+
+/// `cangate buffer plan`
+#[derive(Args, Debug)]
+pub struct PlanArguments {
+    /// The configuration file.
+    #[arg(short, long, default_value = DEFAULT_FILE, value_name = "FILE")]
+    pub config: PathBuf,
+    /// Hours without a broker: how much room do they need?
+    #[arg(long, value_name = "HOURS", conflicts_with = "bytes", value_parser = parse_hours)]
+    pub hours: Option<f64>,
+    /// Room, for example 512M: how long does it last? `buffer_bytes` of the configuration unless given.
+    #[arg(long, value_name = "BYTES", value_parser = parse_size)]
+    pub bytes: Option<u64>,
 }

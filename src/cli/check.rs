@@ -2,13 +2,14 @@
 
 use std::ffi::OsString;
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use super::Exit;
 use super::args::CheckArguments;
-use super::output::{print_line, print_text};
+use super::output::{print_error, print_line, print_text};
+use super::{Exit, check_files, load};
 use crate::config;
 use crate::mapping::{Diagnostic, Severity, SourceText, check_mapping, is_mapping};
+use crate::supervisor::Plan;
 
 /// What came of checking some files. Shown, it is one message after the other and a last line that counts them.
 #[derive(Clone, Debug, Default)]
@@ -61,6 +62,9 @@ impl fmt::Display for Report {
 
 /// Prints the report: on standard output when all is well, on standard error when not.
 pub(super) fn run(arguments: &CheckArguments) -> Exit {
+    if let Some(running) = &arguments.against {
+        return against(running, &arguments.files).unwrap_or_else(|exit| exit);
+    }
     let variables: Vec<(OsString, OsString)> = std::env::vars_os().collect();
     let report = check(&arguments.files, &variables);
     if report.problems.is_empty() {
@@ -69,6 +73,27 @@ pub(super) fn run(arguments: &CheckArguments) -> Exit {
         print_text(&report.to_string());
     }
     report.exit()
+}
+
+/// Prints what a reload would change.
+fn against(running: &Path, files: &[PathBuf]) -> Result<Exit, Exit> {
+    let [file] = files else {
+        print_error("--against compares with one configuration file");
+        return Err(Exit::Usage);
+    };
+    let (old, new) = (load::installation(running)?, load::installation(file)?);
+    let plan = Plan::new(&old, &new);
+    if plan.is_empty() {
+        print_line("nothing changes");
+    }
+    for line in &plan.lines {
+        print_line(line);
+    }
+    if plan.map_breaks.is_empty() || new.reload.allow_map_change {
+        return Ok(Exit::Ok);
+    }
+    print_line("a reload refuses this: published addresses change; see `allow_map_change` under [gateway]");
+    Ok(Exit::Different)
 }
 
 /// Checks configuration files (with the mappings that they use, and the environment's `CANGATE__` variables over them) and
@@ -96,7 +121,10 @@ fn check_text(source: &SourceText, variables: &[(OsString, OsString)]) -> Vec<Di
         check_mapping(source)
     } else {
         let mut read_file = |path: &str| std::fs::read_to_string(path);
-        config::load(source, variables.iter().cloned(), &mut read_file).map(|loaded| loaded.warnings)
+        config::load(source, variables.iter().cloned(), &mut read_file).map(|loaded| {
+            let files = check_files::check(source, &loaded.settings);
+            loaded.warnings.into_iter().chain(files).collect()
+        })
     };
     found.unwrap_or_else(|problems| problems)
 }

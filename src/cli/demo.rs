@@ -1,28 +1,34 @@
-//! `cangate demo`: two simulated engines, a simulated press, a broker and the gateway in one process. \[IO\]
+//! `cangate demo`: simulated engines, a press and serial lines, a broker and the gateway in one process. \[IO\]
 
+use std::fmt::Write;
+use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
 use super::args::DemoArguments;
-use super::output::{block_on, print_error, print_line};
+use super::output::{block_on, print_error, print_line, stop_on_signal};
 use super::{Exit, load, run};
 use crate::can::interface::Interface;
 use crate::can::{self, BusIndex};
 use crate::mqtt::settings::BrokerUrl;
 use crate::simulator;
 use crate::simulator::task::BusEnd;
-use crate::supervisor::{self, Tasks, shutdown};
+use crate::slots::{ServerName, listening};
+use crate::supervisor::{self, Installation, Tasks};
 use crate::time::Clock;
 
-/// The configuration of the demo; what a user would write for two engines and a pressure transmitter.
+/// The configuration of the demo but for its serial lines; what a user would write for two engines, a pressure transmitter
+/// and a module with serial lines. Where the servers listen, the options say.
 const CONFIGURATION: &str = r#"
 version = 1
 [gateway]
 name = "demo"
 [bus.demo]
 interface = "virtual:demo"
+[bus.demo.esd]
+reply_id = 0x6E0
 [node.engine1]
 bus = "demo"
 id = 1
@@ -35,64 +41,121 @@ mapping = "motortech-detcon"
 bus = "demo"
 id = 5
 mapping = "danfoss-dst-p92c"
+[node.serial]
+bus = "demo"
+id = 0x1A
+mapping = "esd-can-cbm-sio4"
+[modbus]
+listen = []
+[http]
+listen = "127.0.0.1:0"
 [mqtt]
+buffer_dir = ""
 "#;
+
+/// What is at the serial lines of the module, from channel 1 on, and what to do there.
+const LINES: [(&str, &str); 3] =
+    [("scanner", "reads every 5 s"), ("balance", "type S and Enter"), ("echo", "type something")];
 
 /// Frames and events that wait between the devices and their bus.
 const QUEUE: usize = 256;
 
 /// Runs until a signal.
 pub(super) fn run(options: &DemoArguments) -> Exit {
-    let mut installation = match load::installation_from_text(CONFIGURATION, "demo") {
-        Ok(installation) => installation,
-        Err(exit) => return exit,
-    };
+    block_on(async {
+        let doors = doors(options.serial).await;
+        match load::installation_from_text(&configuration(&doors), "demo") {
+            Ok(installation) => show(options, installation, &doors).await,
+            Err(exit) => exit,
+        }
+    })
+}
+
+async fn show(options: &DemoArguments, mut installation: Installation, doors: &[Door]) -> Exit {
     installation.modbus.listen = vec![options.modbus];
     installation.http.listen = options.http;
-    block_on(async {
-        let stop = CancellationToken::new();
-        if let Err(error) = shutdown::on_signal(stop.clone()) {
-            print_error(&format!("signals cannot be handled: {error}"));
+    let stop = match stop_on_signal() {
+        Ok(stop) => stop,
+        Err(exit) => return exit,
+    };
+    let broker = match Broker::start(options).await {
+        Ok(broker) => broker,
+        Err(text) => {
+            print_error(&text);
             return Exit::Io;
         }
-        let broker = match Broker::start(options).await {
-            Ok(broker) => broker,
-            Err(text) => {
-                print_error(&text);
-                return Exit::Io;
-            }
-        };
-        let broker_url: BrokerUrl = match broker.url().parse() {
-            Ok(url) => url,
-            Err(error) => {
-                print_error(&format!("--broker: {error}"));
-                return Exit::Usage;
-            }
-        };
-        if let Some(mqtt) = &mut installation.mqtt {
-            mqtt.url = broker_url.clone();
+    };
+    let broker_url: BrokerUrl = match broker.url().parse() {
+        Ok(url) => url,
+        Err(error) => {
+            print_error(&format!("--broker: {error}"));
+            return Exit::Usage;
         }
-        let clock = Clock::start();
-        let bound = match supervisor::bind(installation, clock).await {
-            Ok(bound) => bound,
-            Err(error) => {
-                print_error(&format!("{error}; choose other addresses with --modbus, --mqtt and --http"));
-                return Exit::Io;
-            }
-        };
-        tell(&bound, &broker_url);
-        // A demo whose devices or broker died would go on without a word.
-        let mut tasks = Tasks::default();
-        tasks.spawn("simulated devices", simulate(clock, stop.clone()));
-        let (back, broker_back) = oneshot::channel();
-        tasks.spawn("broker", broker.watch(stop.clone(), back));
-        let exit = run::ended(&bound.run(tasks, stop).await);
-        // After the gateway, so that it can say goodbye.
-        if let Ok(broker) = broker_back.await {
-            broker.stop().await;
+    };
+    if let Some(mqtt) = &mut installation.mqtt {
+        mqtt.url = broker_url.clone();
+    }
+    let clock = Clock::start();
+    let bound = match supervisor::bind(installation, clock).await {
+        Ok(bound) => bound,
+        Err(error) => {
+            print_error(&format!(
+                "{error}; choose other addresses with --modbus, --mqtt, --http and --serial"
+            ));
+            return Exit::Io;
         }
-        exit
-    })
+    };
+    tell(&bound, &broker_url, doors);
+    // A demo whose devices or broker died would go on without a word.
+    let mut tasks = Tasks::default();
+    tasks.spawn("simulated devices", simulate(clock, stop.clone()));
+    let (back, broker_back) = oneshot::channel();
+    tasks.spawn("broker", broker.watch(stop.clone(), back));
+    let exit = run::ended(&bound.run(tasks, stop).await);
+    // After the gateway, so that it can say goodbye.
+    if let Ok(broker) = broker_back.await {
+        broker.stop().await;
+    }
+    exit
+}
+
+/// Where a serial line listens, or why it cannot.
+type Door = (SocketAddr, io::Result<()>);
+
+/// The TCP ports of the serial lines. The demo does without those that are taken.
+async fn doors(first: SocketAddr) -> Vec<Door> {
+    let mut address = first;
+    // Held until all are there, so that the system does not give one free port to two of them.
+    let mut listeners = Vec::new();
+    for (device, _) in LINES {
+        listeners.push((address, listening::bind(&ServerName::new(device, "--serial"), address).await));
+        if address.port() != 0 {
+            address.set_port(address.port().saturating_add(1));
+        }
+    }
+    let told = listeners.iter().map(|(address, listener)| match listener {
+        Ok(listener) => {
+            listener.local_addr().map_or_else(|error| (*address, Err(error)), |bound| (bound, Ok(())))
+        }
+        Err(error) => (*address, Err(error.source.kind().into())),
+    });
+    told.collect()
+}
+
+/// The whole configuration.
+fn configuration(doors: &[Door]) -> String {
+    let mut text = CONFIGURATION.to_owned();
+    for (channel, ((device, _), (address, free))) in (1..).zip(LINES.iter().zip(doors)) {
+        // Writing to a text does not fail.
+        let _ = write!(
+            text,
+            "[node.serial.channel.{channel}]\ndescription = \"{device}\"\nmax_char = 8\ninhibit_ms = 8\n"
+        );
+        if free.is_ok() {
+            let _ = writeln!(text, "listen = \"{address}\"");
+        }
+    }
+    text
 }
 
 /// The devices on their virtual bus.
@@ -110,30 +173,51 @@ async fn simulate(clock: Clock, stop: CancellationToken) {
 }
 
 /// The lines that a newcomer can paste, and what there is to see.
-fn tell(bound: &supervisor::Bound, broker: &BrokerUrl) {
+fn tell(bound: &supervisor::Bound, broker: &BrokerUrl, doors: &[Door]) {
     let modbus = bound.modbus_addresses().first().copied();
     let (host, port) =
         modbus.map_or((String::new(), 0), |address| (reachable(address).ip().to_string(), address.port()));
     let (broker_host, broker_port) = host_and_port(broker);
-    let page = format!("http://{}/", reachable(bound.http_address()));
-    for line in [
-        "cangate demo: two simulated engines and a press; Ctrl-C ends it. Connect from another terminal:".to_owned(),
+    let subscribe = format!("mosquitto_sub -h {broker_host} -p {broker_port} -v -t");
+    let mut lines = vec![
+        "cangate demo: two simulated engines, a press and serial lines; Ctrl-C ends it. Connect from another terminal:"
+            .to_owned(),
         String::new(),
         format!("  engine 1     mbpoll -m tcp -a 1 -0 -r 100 -c 20 -t 3 -1 -p {port} {host}"),
         format!("  hydraulics   mbpoll -m tcp -a 5 -0 -r 100 -c 1 -t 3:float -B -1 -p {port} {host}"),
-        format!("  MQTT         mosquitto_sub -h {broker_host} -p {broker_port} -v -t 'cangate/#'"),
-        format!("  page         {page}"),
+    ];
+    lines.extend(LINES.iter().zip(doors).map(|(line, door)| tell_line(*line, door)));
+    lines.extend([
+        format!("  MQTT         {subscribe} 'cangate/#'"),
+        format!("  serial lines {subscribe} 'cangate/demo/serial/serial/+/rx'"),
+        format!("  page         http://{}/", reachable(bound.http_address())),
         String::new(),
         "Engine 1 knocks on cylinder 7 within ten seconds (register 106, unit 1), and again every minute. The press of the"
             .to_owned(),
         "hydraulics (unit 5) raises its pressure from 180 to 320 bar every 20 s: registers 100 and 101, a float in bar; 104,"
             .to_owned(),
-        "tenths of a degree. Unit 2 is the other engine, unit 247 the gateway. `cangate demo --help`: how to move the ports."
+        "tenths of a degree. Unit 2 is the other engine, 26 the module with the serial lines, 247 the gateway."
             .to_owned(),
+        "`cangate demo --help`: how to move the ports.".to_owned(),
         String::new(),
-    ] {
+    ]);
+    for line in lines {
         if !print_line(&line) {
             return;
+        }
+    }
+}
+
+/// How to get at what is at a serial line, or why one cannot.
+fn tell_line((device, what): (&str, &str), (address, free): &Door) -> String {
+    match free {
+        Ok(()) => {
+            let address = reachable(*address);
+            let connect = format!("nc {} {}", address.ip(), address.port());
+            format!("  {device:<12} {connect:<20} ({what})")
+        }
+        Err(error) => {
+            format!("  {device:<12} no TCP port: {address}: {error}; `--serial ADDRESS` moves all three")
         }
     }
 }
@@ -176,8 +260,8 @@ impl Broker {
     async fn start_inside(address: SocketAddr) -> Result<Self, String> {
         let broker = crate::mqtt::broker::EmbeddedBroker::start(address).await;
         broker.map(Self::Inside).map_err(|error| {
-            let there = host_and_port(&BrokerUrl { host: address.ip().to_string(), port: address.port() });
-            let there = BrokerUrl { host: there.0, port: there.1 };
+            let there = host_and_port(&BrokerUrl { host: address.ip().to_string(), port: address.port(), tls: false });
+            let there = BrokerUrl { host: there.0, port: there.1, tls: false };
             format!(
                 "{error} Use the broker that is there already with `--broker {there}`, or choose another address with \
                  --mqtt."
@@ -234,12 +318,40 @@ impl Broker {
 mod tests {
     use super::*;
 
-    #[test]
-    fn the_devices_of_the_demo_are_the_nodes_that_its_gateway_knows() {
-        let installation = load::installation_from_text(CONFIGURATION, "demo").unwrap();
-        let configured: Vec<u8> = installation.table.nodes.iter().map(|node| node.canopen.id.get()).collect();
+    #[tokio::test]
+    async fn the_devices_of_the_demo_are_the_nodes_that_its_gateway_knows() {
+        let text = configuration(&doors("127.0.0.1:0".parse().unwrap()).await);
+        let installation = load::installation_from_text(&text, "demo").unwrap();
+        let configured: Vec<u8> =
+            installation.table.nodes.iter().map(crate::mapping::NodeDef::number).collect();
         let simulated: Vec<u8> = simulator::demo().iter().map(|plan| plan.node.get()).collect();
         assert_eq!(configured, simulated);
+    }
+
+    #[tokio::test]
+    async fn where_a_serial_port_is_taken_the_line_has_none_and_says_so_and_the_others_are_as_always() {
+        let any = doors("127.0.0.1:0".parse().unwrap()).await;
+        assert!(any.iter().all(|(address, free)| free.is_ok() && address.port() != 0), "{any:?}");
+        // Some port has one below and one above it that are free.
+        let (taken, doors) = loop {
+            let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+            let mut first = taken.local_addr().unwrap();
+            first.set_port(first.port() - 1);
+            let doors = doors(first).await;
+            if let [(_, Ok(())), (_, Err(_)), (_, Ok(()))] = doors.as_slice() {
+                break (taken, doors);
+            }
+        };
+        let address = taken.local_addr().unwrap();
+        let said = tell_line(LINES[1], &doors[1]);
+        assert!(said.contains(&format!("balance      no TCP port: {address}")), "{said}");
+        assert!(said.contains("--serial"), "{said}");
+        let installation = load::installation_from_text(&configuration(&doors), "demo").unwrap();
+        let listens: Vec<Option<u16>> =
+            installation.table.lines.iter().map(|line| Some(line.tcp.as_ref()?.listen.port())).collect();
+        assert_eq!(listens, [Some(address.port() - 1), None, Some(address.port() + 1)]);
+        let said = tell_line(LINES[2], &doors[2]);
+        assert!(said.contains(&format!("nc 127.0.0.1 {} ", address.port() + 1)), "{said}");
     }
 
     #[test]

@@ -4,15 +4,18 @@ use std::fmt;
 use std::io;
 use std::path::Path;
 
-use super::Exit;
 use super::args::ImportArguments;
 use super::output::{print_diagnostics, print_error, print_text, write_out};
+use super::{Exit, eds_files};
 use crate::mapping::SourceText;
 use crate::mapping::eds::{self, Eds, Imported};
 
 /// Writes the mapping, to standard output or to a file, which is updated if it is there already; warnings and a summary go
 /// to standard error.
 pub(super) fn run(arguments: &ImportArguments) -> Exit {
+    if arguments.list {
+        return eds_files::list(&arguments.file).err().unwrap_or(Exit::Ok);
+    }
     let output = arguments.output.as_deref();
     match make(&arguments.file, output) {
         Ok(made) => {
@@ -123,7 +126,7 @@ mod tests {
     fn arguments(folder: &Path, eds: &[u8]) -> ImportArguments {
         let file = folder.join("a.eds");
         std::fs::write(&file, eds).unwrap();
-        ImportArguments { file, output: Some(folder.join("a.toml")) }
+        ImportArguments { file, output: Some(folder.join("a.toml")), list: false }
     }
 
     #[test]
@@ -159,12 +162,12 @@ mod tests {
     fn exit_codes_tell_an_unreadable_file_from_a_malformed_one() {
         let folder = tempfile::tempdir().unwrap();
         let good = arguments(folder.path(), EDS.as_bytes());
-        let none = ImportArguments { file: folder.path().join("none.eds"), output: None };
+        let none = ImportArguments { file: folder.path().join("none.eds"), output: None, list: false };
         assert_eq!(run(&none), Exit::Io);
         std::fs::write(good.output.as_ref().unwrap(), "format = 1\n").unwrap();
         assert_eq!(run(&good), Exit::Configuration, "a mapping that import did not write");
         assert_eq!(std::fs::read_to_string(good.output.as_ref().unwrap()).unwrap(), "format = 1\n");
-        let nowhere = ImportArguments { output: Some(folder.path().join("no/where.toml")), file: good.file };
+        let nowhere = ImportArguments { output: Some(folder.path().join("no/where.toml")), ..good };
         assert_eq!(run(&nowhere), Exit::Io);
         assert_eq!(run(&arguments(folder.path(), b"no EDS")), Exit::Configuration);
     }

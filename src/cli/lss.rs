@@ -5,11 +5,10 @@ use tokio_util::sync::CancellationToken;
 use super::Exit;
 use super::lss_args::{LssArguments, LssCommand};
 use super::lss_job::LssTask;
-use super::output::{block_on, print_error, print_line};
+use super::output::{block_on, print_error, print_line, stop_on_signal};
 use super::session::{Session, SessionError, check_company};
 use crate::can::interface::Interface;
 use crate::canopen::lss::{LssAddress, LssAnswer, LssError, LssJob, LssKnown, LssState};
-use crate::supervisor::shutdown;
 use crate::time::Clock;
 
 /// Does what is asked and prints what came of it.
@@ -22,11 +21,10 @@ pub(super) fn run(arguments: &LssArguments) -> Exit {
         }
     };
     block_on(async {
-        let stop = CancellationToken::new();
-        if let Err(error) = shutdown::on_signal(stop.clone()) {
-            print_error(&format!("signals cannot be handled: {error}"));
-            return Exit::Io;
-        }
+        let stop = match stop_on_signal() {
+            Ok(stop) => stop,
+            Err(exit) => return exit,
+        };
         let done = match check_company(&arguments.interface) {
             Ok(()) => perform(&arguments.interface, task, Clock::start(), stop).await,
             Err(error) => Err(error),

@@ -4,9 +4,18 @@
 //! bug, 74 a port, a bus or a file cannot be used at the start, 78 what a file says is wrong.
 
 mod args;
+mod buffer;
 pub mod check;
+mod check_files;
+mod check_secrets;
 mod completions;
+mod dcf;
 mod demo;
+mod eds_files;
+mod esd;
+mod esd_args;
+mod esd_job;
+mod esd_report;
 mod health;
 mod import;
 mod init;
@@ -16,8 +25,10 @@ mod lss_args;
 mod lss_job;
 mod man;
 mod map;
+mod map_frames;
 mod nmt;
 mod output;
+mod password;
 mod replay;
 mod run;
 mod scan;
@@ -99,17 +110,21 @@ fn dispatch(command: Subcommand) -> Exit {
         Subcommand::Check(options) => check::run(&options),
         Subcommand::Map(options) => map::run(&options),
         Subcommand::Import(options) => import::run(&options),
+        Subcommand::Dcf(options) => dcf::run(&options),
         Subcommand::Sim(options) => sim::command(&options),
         Subcommand::Replay(options) => replay::run(&options),
         Subcommand::Schema(options) => schema::run(&options),
         Subcommand::Completions(options) => completions::run(&options),
         Subcommand::Man(options) => man::run(&options),
+        Subcommand::Buffer(arguments) => buffer::run(&arguments),
         Subcommand::Health(options) => health::run(&options),
+        Subcommand::Password => password::run(),
         Subcommand::Scan(options) => scan::run(&options),
         Subcommand::Init(options) => init::run(&options),
         Subcommand::Nmt(options) => nmt::run(&options),
         Subcommand::Sdo(options) => sdo::run(&options),
         Subcommand::Lss(options) => lss::run(&options),
+        Subcommand::Esd(options) => esd::run(&options),
     }
 }
 
@@ -139,13 +154,18 @@ mod tests {
             &["demo"],
             &["check", "a.toml"],
             &["map", "--format", "csv"],
+            &["map", "--frames", "-c", "a.toml", "--format", "json"],
             &["map", "diff", "a.json", "b.json"],
             &["import", "a.eds", "-o", "a.toml"],
+            &["import", "--list", "eds"],
+            &["dcf", "-c", "a.toml", "--eds", "eds", "-o", "dcf"],
+            &["dcf", "--eds", "a.eds", "tank1"],
             &["sim", "detcon", "-i", "vcan0", "--node", "1"],
             &["replay", "bus.log"],
             &["schema", "config"],
             &["completions", "bash"],
             &["man"],
+            &["password"],
             &["health", "http://127.0.0.1:8080/readyz"],
             &["scan", "-i", "can0"],
             &["scan", "-i", "can0", "--active", "--nodes", "1-10", "--format", "json"],
@@ -157,6 +177,8 @@ mod tests {
             &["lss", "-i", "can0", "scan", "--vendor", "0x23D", "--product", "1"],
             &["lss", "-i", "can0", "set-node-id", "--node", "1", "--to", "5", "--bit-rate", "250"],
             &["lss", "-i", "can0", "inquire", "--only-one-device"],
+            &["esd", "scan", "-i", "can0", "--reply-id", "0x6E0", "--all"],
+            &["esd", "reset", "-i", "can0", "--all", "--yes"],
             &["sdo", "-i", "can0", "--node", "1", "write", "0x6124:1", "-1.5", "--type", "f32"],
         ] {
             let line = std::iter::once("cangate").chain(words.iter().copied());

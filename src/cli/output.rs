@@ -1,11 +1,16 @@
-//! Printing: the only place that writes to standard output and standard error. \[IO\]
+//! What every command needs: printing, files, a runtime, the order to stop. \[IO\]
+//!
+//! It is the only place that writes to standard output and standard error.
 
 use std::io::{self, Write};
 use std::path::Path;
 use std::time::Duration;
 
+use tokio_util::sync::CancellationToken;
+
 use super::Exit;
 use crate::mapping::Diagnostic;
+use crate::supervisor::shutdown;
 
 /// A line for the user on standard output. `false` when nobody reads any more (`| head`).
 pub(super) fn print_line(text: &str) -> bool {
@@ -32,13 +37,18 @@ pub(super) fn print_diagnostics(diagnostics: &[Diagnostic]) {
 
 /// Writes a text to a file, or to standard output without one.
 pub(super) fn write_out(text: &str, file: Option<&Path>) -> Exit {
+    write_bytes(text.as_bytes(), file)
+}
+
+/// The same for a text of another character set.
+pub(super) fn write_bytes(bytes: &[u8], file: Option<&Path>) -> Exit {
     let written = match file {
         Some(file) => {
-            std::fs::write(file, text).map_err(|error| format!("cannot write {}: {error}", file.display()))
+            std::fs::write(file, bytes).map_err(|error| format!("cannot write {}: {error}", file.display()))
         }
         None => io::stdout()
             .lock()
-            .write_all(text.as_bytes())
+            .write_all(bytes)
             .or_else(|error| if error.kind() == io::ErrorKind::BrokenPipe { Ok(()) } else { Err(error) })
             .map_err(|error| format!("cannot write to standard output: {error}")),
     };
@@ -62,6 +72,18 @@ pub(super) fn read_file(path: &Path) -> Result<String, Exit> {
 /// How long the end waits for threads that are held up in the system: one that asks a name server which does not answer
 /// would hold the process for half a minute.
 const LEAVE_BEHIND: Duration = Duration::from_millis(500);
+
+/// What SIGTERM and SIGINT cancel; a second one ends the process at once. To be called on a runtime.
+pub(super) fn stop_on_signal() -> Result<CancellationToken, Exit> {
+    let stop = CancellationToken::new();
+    match shutdown::on_signal(stop.clone()) {
+        Ok(()) => Ok(stop),
+        Err(error) => {
+            print_error(&format!("signals cannot be handled: {error}"));
+            Err(Exit::Io)
+        }
+    }
+}
 
 /// Runs a future on a new runtime. What still runs when it ends is left behind.
 pub(super) fn block_on(future: impl Future<Output = Exit>) -> Exit {

@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
 use super::Exit;
-use super::output::{block_on, print_error, write_out};
+use super::output::{block_on, print_error, stop_on_signal, write_out};
 use super::scan_report::{ScanReport, found_node, sighting};
 use super::session::{Machine, Session, SessionError, Step, check_company};
 use super::tool_args::{ScanArguments, ScanFormat, ScanOptions};
@@ -17,7 +17,6 @@ use crate::canopen::census::{Census, NodeRecord};
 use crate::canopen::probe::{Identity, Probe, ProbeOutput, ProbeSettings};
 use crate::mapping::fingerprint::candidates;
 use crate::mapping::shipped::SHIPPED;
-use crate::supervisor::shutdown;
 use crate::time::{Clock, Instant, Now};
 
 /// Scans and prints.
@@ -40,11 +39,7 @@ fn text(report: &ScanReport, format: ScanFormat) -> String {
 
 /// A scan of an interface of the host, which SIGINT ends early. Problems are printed.
 pub(super) async fn survey(interface: &Interface, options: ScanOptions) -> Result<ScanReport, Exit> {
-    let stop = CancellationToken::new();
-    if let Err(error) = shutdown::on_signal(stop.clone()) {
-        print_error(&format!("signals cannot be handled: {error}"));
-        return Err(Exit::Io);
-    }
+    let stop = stop_on_signal()?;
     let scanned = match check_company(interface) {
         Ok(()) => scan(interface, options, Clock::start(), stop).await,
         Err(error) => Err(error),

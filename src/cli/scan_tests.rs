@@ -32,8 +32,9 @@ async fn scan_beside_a_detcon(bus: &str, started: bool, active: bool) -> (ScanRe
     let device = SimOptions {
         kind: Kind::Detcon,
         interface: interface.clone(),
-        node: NodeId::new(3).unwrap(),
+        node: NodeId::new(3).unwrap().into(),
         count: 1,
+        serial: Vec::new(),
         scenario: None,
         seed: 1,
     };
@@ -182,8 +183,9 @@ async fn scan_of(
             let device = SimOptions {
                 kind: *kind,
                 interface: interface.clone(),
-                node: NodeId::new(*node).unwrap(),
+                node: NodeId::new(*node).unwrap().into(),
                 count: 1,
+                serial: Vec::new(),
                 scenario: Some((*scenario).to_owned()),
                 seed: 1,
             };
@@ -247,8 +249,7 @@ async fn r_dst_001_who_is_asked_is_named_beyond_doubt_and_init_takes_its_mapping
     let source = crate::mapping::SourceText::new("nowhere/cangate.toml", text.as_str());
     let none = std::io::ErrorKind::NotFound;
     let loaded = crate::config::load(&source, [], &mut |_| Err(none.into())).unwrap();
-    let nodes: Vec<_> =
-        loaded.table.nodes.iter().map(|node| (node.name.as_str(), node.canopen.id.get())).collect();
+    let nodes: Vec<_> = loaded.table.nodes.iter().map(|node| (node.name.as_str(), node.number())).collect();
     assert_eq!(nodes, [("detcon-3", 3), ("dst-p92c-5", 5), ("dst-p92c-6", 6)], "{text}");
     assert_eq!(loaded.warnings, []);
 }

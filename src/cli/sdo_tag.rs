@@ -46,8 +46,13 @@ fn table(arguments: &SdoArguments, name: &str) -> Result<(TagTable, NodeIndex), 
         return Err(Exit::Usage);
     };
     let loaded = load::configuration(file)?;
-    let has_id =
-        |place: &usize| loaded.table.nodes.get(*place).is_some_and(|node| node.canopen.id == arguments.node);
+    let has_id = |place: &usize| {
+        loaded
+            .table
+            .nodes
+            .get(*place)
+            .is_some_and(|node| node.canopen().is_some_and(|settings| settings.id == arguments.node))
+    };
     let is_here = |place: &usize| {
         let bus = loaded.table.nodes.get(*place).map(|node| node.bus);
         bus.and_then(|bus| loaded.interfaces.get(bus.0)) == Some(&arguments.interface)

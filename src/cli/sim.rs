@@ -12,13 +12,14 @@ use tokio_util::sync::CancellationToken;
 
 use super::Exit;
 use super::args::{SimArguments, SimDevice};
-use super::output::{block_on, print_error};
+use super::output::{block_on, print_error, stop_on_signal};
 use crate::can::interface::Interface;
 use crate::can::{self, BusIndex};
-use crate::canopen::NodeId;
+use crate::simulator::cbm_sio::line::LineKind;
+use crate::simulator::serial_end::SerialEnd;
+use crate::simulator::serial_place::SerialPlace;
 use crate::simulator::task::{self, BusEnd};
-use crate::simulator::{DevicePlan, Kind, Scenario, SimulatorError};
-use crate::supervisor::shutdown;
+use crate::simulator::{DeviceNumber, DevicePlan, Kind, Scenario, Settings, SimulatorError};
 use crate::time::Clock;
 
 /// Frames that wait for the bus. 127 devices that start at once send 508.
@@ -43,10 +44,12 @@ pub struct SimOptions {
     pub kind: Kind,
     /// The bus.
     pub interface: Interface,
-    /// Node id of the first device.
-    pub node: NodeId,
-    /// How many devices, at least one; their node ids follow each other.
+    /// Number of the first device.
+    pub node: DeviceNumber,
+    /// How many devices, at least one; their numbers follow each other.
     pub count: u8,
+    /// Outside ends of serial channels.
+    pub serial: Vec<SerialPlace>,
     /// A file, or the name of a scenario that comes with the program; `quiet` when `None`.
     pub scenario: Option<String>,
     /// Equal seeds give equal values; each device has its own noise all the same.
@@ -56,15 +59,37 @@ pub struct SimOptions {
 /// Why the simulation does not begin.
 #[derive(Debug, thiserror::Error)]
 pub enum SimError {
-    /// The last node id would be above 127.
-    #[error("{count} devices from node {node} on need node ids up to {last}, but 127 is the highest")]
-    NodeIds {
+    /// The last number would be above the highest of its kind.
+    #[error("{count} devices from node {node} on need numbers up to {last}, but {highest} is the highest of a {}", kind.word())]
+    Numbers {
+        /// The device.
+        kind: Kind,
+        /// Its highest number.
+        highest: u8,
         /// The first.
-        node: NodeId,
+        node: DeviceNumber,
         /// How many.
         count: u8,
         /// The last.
         last: u16,
+    },
+    /// An outside end for what has none.
+    #[error("--serial {place}: {reason}")]
+    Serial {
+        /// As the user wrote it.
+        place: SerialPlace,
+        /// What is wrong, and how to mend it.
+        reason: String,
+    },
+    /// An outside end cannot be opened.
+    #[error(
+        "--serial {place} cannot be opened: {source}; give a name that no other file has, or an address of this host"
+    )]
+    OpenSerial {
+        /// As the user wrote it.
+        place: SerialPlace,
+        /// What the system says.
+        source: std::io::Error,
     },
     /// A bus inside this process, where nobody else can be.
     #[error(
@@ -95,8 +120,8 @@ impl SimError {
     #[must_use]
     pub fn exit(&self) -> Exit {
         match self {
-            Self::NodeIds { .. } | Self::Alone { .. } => Exit::Usage,
-            Self::ReadScenario { .. } => Exit::Io,
+            Self::Numbers { .. } | Self::Serial { .. } | Self::Alone { .. } => Exit::Usage,
+            Self::ReadScenario { .. } | Self::OpenSerial { .. } => Exit::Io,
             Self::Scenario(_) => Exit::Configuration,
         }
     }
@@ -111,13 +136,15 @@ pub(super) fn command(arguments: &SimArguments) -> Exit {
     let kind = match arguments.device {
         SimDevice::Detcon => Kind::Detcon,
         SimDevice::DstP92c => Kind::DstP92c,
+        SimDevice::CbmSio1 => Kind::CbmSio1,
+        SimDevice::CbmSio4 => Kind::CbmSio4,
     };
-    let Some(node) = NodeId::new(arguments.node) else { return Exit::Usage };
     let options = SimOptions {
         kind,
         interface: arguments.interface.clone(),
-        node,
+        node: arguments.node,
         count: arguments.count,
+        serial: arguments.serial.clone(),
         scenario: arguments.scenario.clone(),
         seed: arguments.seed,
     };
@@ -125,11 +152,10 @@ pub(super) fn command(arguments: &SimArguments) -> Exit {
         return refuse(&error);
     }
     block_on(async {
-        let stop = CancellationToken::new();
-        if let Err(error) = shutdown::on_signal(stop.clone()) {
-            print_error(&format!("signals cannot be handled: {error}"));
-            return Exit::Io;
-        }
+        let stop = match stop_on_signal() {
+            Ok(stop) => stop,
+            Err(exit) => return exit,
+        };
         match run(options, orders(), io::stdout(), Clock::start(), stop).await {
             Ok(()) => Exit::Ok,
             Err(error) => refuse(&error),
@@ -187,13 +213,33 @@ impl Read for Terminal {
 
 /// The devices that are asked for. Reads the scenario's file.
 pub fn plan(options: &SimOptions) -> Result<Vec<DevicePlan>, SimError> {
-    let scenario = scenario(options.kind, options.scenario.as_deref().unwrap_or("quiet"))?;
-    let count = options.count.max(1);
+    let mut scenario = scenario(options.kind, options.scenario.as_deref().unwrap_or("quiet"))?;
+    for (at, place) in options.serial.iter().enumerate() {
+        let wrong = |reason: String| Err(SimError::Serial { place: place.clone(), reason });
+        let Settings::CbmSio(settings) = &mut scenario.settings else {
+            return wrong(format!("a {} has no serial channels", options.kind.word()));
+        };
+        let channels = settings.model.channels();
+        if place.channel > channels {
+            return wrong(format!("a {} has no channel beyond {channels}", options.kind.word()));
+        }
+        if options.serial.iter().take(at).any(|other| other.channel == place.channel) {
+            return wrong("the channel has an end already; give each one once".to_owned());
+        }
+        if options.count > 1 {
+            return wrong("which of the devices is meant? start one at a time (--count 1)".to_owned());
+        }
+        if let Some(line) = settings.lines.get_mut(usize::from(place.channel) - 1) {
+            *line = LineKind::External;
+        }
+    }
+    let (kind, count, highest) = (options.kind, options.count.max(1), options.kind.highest_number());
     (0..count)
         .map(|place| {
-            let id = options.node.get().checked_add(place).and_then(NodeId::new);
+            let number = options.node.get().checked_add(place).filter(|number| *number <= highest);
             let last = u16::from(options.node.get()) + u16::from(count) - 1;
-            let node = id.ok_or(SimError::NodeIds { node: options.node, count, last })?;
+            let node = number.and_then(DeviceNumber::new);
+            let node = node.ok_or(SimError::Numbers { kind, highest, node: options.node, count, last })?;
             let seed = options.seed.wrapping_add(u64::from(node.get()));
             Ok(DevicePlan { seed, ..DevicePlan::new(node, scenario.clone()) })
         })
@@ -223,6 +269,11 @@ pub async fn run(
     stop: CancellationToken,
 ) -> Result<(), SimError> {
     let plans = plan(&options)?;
+    let mut ends = Vec::new();
+    for place in &options.serial {
+        let end = SerialEnd::open(place).await;
+        ends.push(end.map_err(|source| SimError::OpenSerial { place: place.clone(), source })?);
+    }
     let (events_to_us, events) = mpsc::channel(EVENT_QUEUE);
     let (transmit, to_send) = mpsc::channel(TRANSMIT_QUEUE);
     let (lines_to_us, lines) = mpsc::channel(LINE_QUEUE);
@@ -236,7 +287,7 @@ pub async fn run(
     });
     let bus =
         can::task::run(BusIndex(0), options.interface, false, events_to_us, to_send, clock, stop.clone());
-    let devices = task::run(plans, BusEnd { events, transmit }, lines, reports, clock, stop);
+    let devices = task::run_with_ends(plans, ends, BusEnd { events, transmit }, lines, reports, clock, stop);
     tokio::join!(bus, devices);
     // What is not printed by now is not worth waiting for.
     let _ = tokio::time::timeout(LAST_REPORTS, printed).await;
@@ -279,8 +330,9 @@ mod tests {
         SimOptions {
             kind: Kind::Detcon,
             interface: "virtual:cli-sim-test".parse().unwrap(),
-            node: NodeId::new(1).unwrap(),
+            node: DeviceNumber::new(1).unwrap(),
             count: 1,
+            serial: Vec::new(),
             scenario: None,
             seed: 1,
         }
@@ -313,7 +365,7 @@ mod tests {
     #[test]
     fn devices_get_the_node_ids_that_follow() {
         let ids = |node, count| {
-            let options = SimOptions { node: NodeId::new(node).unwrap(), count, ..options() };
+            let options = SimOptions { node: DeviceNumber::new(node).unwrap(), count, ..options() };
             plan(&options).map(|plans| plans.iter().map(|plan| plan.node.get()).collect::<Vec<_>>())
         };
         assert_eq!(ids(3, 2).unwrap(), [3, 4]);
@@ -322,6 +374,39 @@ mod tests {
         assert_eq!(error.exit(), Exit::Usage);
         assert!(error.to_string().contains("up to 128"), "{error}");
         assert_eq!(ids(127, 255).unwrap_err().exit(), Exit::Usage);
+    }
+
+    #[test]
+    fn an_esd_module_has_the_numbers_of_its_switches() {
+        let last = |kind, node| {
+            plan(&SimOptions { kind, node: DeviceNumber::new(node).unwrap(), ..options() }).map(|_| ())
+        };
+        assert!(last(Kind::CbmSio4, 0xCB).is_ok() && last(Kind::CbmSio1, 0xCC).is_ok());
+        assert!(
+            last(Kind::CbmSio4, 0xCC).unwrap_err().to_string().contains("203 is the highest of a cbm-sio4")
+        );
+        assert!(last(Kind::Detcon, 128).is_err());
+    }
+
+    #[test]
+    fn an_outside_end_is_for_a_channel_that_there_is() {
+        let with = |kind, count, places: &[&str]| {
+            let serial = places.iter().map(|place| place.parse().unwrap()).collect();
+            plan(&SimOptions { kind, count, serial, ..options() })
+        };
+        let plans = with(Kind::CbmSio4, 1, &["2=tcp:127.0.0.1:0"]).unwrap();
+        let Settings::CbmSio(settings) = &plans[0].scenario.settings else { panic!() };
+        assert_eq!(settings.lines[..2], [LineKind::Echo, LineKind::External]);
+        for (kind, count, places, reason) in [
+            (Kind::Detcon, 1, &["1=pty:/tmp/x"][..], "no serial channels"),
+            (Kind::CbmSio1, 1, &["2=pty:/tmp/x"], "no channel beyond 1"),
+            (Kind::CbmSio4, 1, &["2=pty:/tmp/x", "2=pty:/tmp/y"], "already"),
+            (Kind::CbmSio4, 2, &["2=pty:/tmp/x"], "--count 1"),
+        ] {
+            let error = with(kind, count, places).unwrap_err();
+            assert_eq!(error.exit(), Exit::Usage);
+            assert!(error.to_string().contains(reason), "{error}");
+        }
     }
 
     #[test]
@@ -364,8 +449,9 @@ mod tests {
         let arguments = SimArguments {
             device: SimDevice::Detcon,
             interface: options().interface,
-            node: 1,
+            node: DeviceNumber::new(1).unwrap(),
             count: 1,
+            serial: Vec::new(),
             scenario: None,
             seed: 1,
         };

@@ -108,8 +108,9 @@ fn set(
             format!("set {PREFIX}MQTT__URL too, or write an [mqtt] into the file"),
         ));
     }
-    let value = value.into_string().map_err(|value| {
-        (format!("its value {} is not UTF-8", value.display()), format!("it sets `{key}` in [{section}]"))
+    let value = value.into_string().map_err(|_secret| {
+        // The value itself may be a secret in the wrong place.
+        ("its value is not UTF-8".to_owned(), format!("it sets `{key}` in [{section}]"))
     })?;
     let before = Process {
         gateway: settings.gateway.clone(),
@@ -118,7 +119,8 @@ fn set(
         http: settings.http.clone(),
         cia309: settings.cia309.clone(),
     };
-    let place = format!("{section}.{key}");
+    // A table within it is written as its part of the name: CANGATE__MQTT__TLS__CA_FILE.
+    let place = format!("{section}.{}", key.replace("__", "."));
     let list: Vec<&str> = value.split(',').map(str::trim).filter(|item| !item.is_empty()).collect();
     // A text for a list's key is refused as such; then it is meant as a list. The first message is the one to tell.
     let after = layered(&before, &place, config::Value::from(value.as_str()))
@@ -196,6 +198,25 @@ mod tests {
     }
 
     #[test]
+    fn a_key_of_a_table_within_is_set_by_its_parts() {
+        let (settings, problems) = with(
+            "",
+            &[("CANGATE__MQTT__URL", "mqtts://broker"), ("CANGATE__MQTT__TLS__CA_FILE", "/run/Ca.pem")],
+        );
+        assert_eq!(problems, Vec::<String>::new());
+        assert_eq!(settings.mqtt.unwrap().tls.ca_file.unwrap().to_str(), Some("/run/Ca.pem"));
+    }
+
+    #[test]
+    fn a_key_of_a_table_in_a_table_has_one_more_step() {
+        let (settings, problems) = with("[mqtt]\n", &[("CANGATE__MQTT__HOME_ASSISTANT__ENABLED", "true")]);
+        assert_eq!(problems, [""; 0]);
+        assert!(settings.mqtt.unwrap().home_assistant.enabled);
+        let (_, problems) = with("[mqtt]\n", &[("CANGATE__MQTT__HOME_ASSISTANT__ENABLE", "true")]);
+        assert!(problems[0].contains("unknown field `enable`"), "{problems:?}");
+    }
+
+    #[test]
     fn no_other_variable_switches_mqtt_on() {
         let (settings, problems) = with("", &[("CANGATE__MQTT__KEEP_ALIVE_S", "30")]);
         assert_eq!(settings.mqtt, None);
@@ -230,9 +251,8 @@ mod tests {
         let texts: Vec<String> = overlay.problems.iter().map(ToString::to_string).collect();
         assert_eq!(texts.len(), 2, "{texts:?}");
         assert!(
-            texts[0].starts_with(
-                "environment variable CANGATE__GATEWAY__NAME: error: its value hall-\u{FFFD} is not UTF-8"
-            ),
+            texts[0]
+                .starts_with("environment variable CANGATE__GATEWAY__NAME: error: its value is not UTF-8"),
             "{texts:?}"
         );
         assert!(texts[1].contains("does not name a setting"), "{texts:?}");
@@ -257,6 +277,7 @@ mod tests {
             ("CANGATE__MODBUS__MAX_CONNECTIONS", "6.7", "6.7"),
             ("CANGATE__MODBUS__MAX_CONNECTIONS", "many", "many"),
             ("CANGATE__MQTT__URL", "http://broker", "is not a broker's address"),
+            ("CANGATE__MQTT__TLS__CA", "x", "unknown field `ca`"),
         ] {
             let (_, problems) = with("[mqtt]\n", &[(name, value)]);
             assert_eq!(problems.len(), 1, "{name}={value}");

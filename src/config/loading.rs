@@ -6,13 +6,16 @@ use std::io;
 use std::path::Path;
 
 use super::environment::{self, Overlay};
+use super::listeners;
 use super::settings::Settings;
+use crate::access::Access;
 use crate::can::interface::Interface;
 use crate::mapping::{
-    At, Diagnostic, Installation, SourceText, TagTable, build, is_name, locate, reader, shipped,
+    At, Diagnostic, Installation, Severity, SourceText, TagTable, build, is_name, locate, reader, shipped,
     sort_problems,
 };
 use crate::mqtt::settings::{MqttSettings, RESERVED_NODE_NAMES};
+use crate::web::settings::KnownBy;
 
 /// Version of the configuration that this program reads.
 const VERSION: u64 = 1;
@@ -26,6 +29,8 @@ pub struct Loaded {
     pub interfaces: Vec<Interface>,
     /// Buses, nodes, tags and alarms.
     pub table: TagTable,
+    /// Who may ask for what.
+    pub access: Access,
     /// What works but is probably not meant.
     pub warnings: Vec<Diagnostic>,
 }
@@ -51,9 +56,12 @@ pub fn load(
     problems.extend(check(source, &settings, &overlay));
     let (interfaces, wrong) = interfaces(source, &settings);
     problems.extend(wrong);
+    problems.extend(listeners::check(source, &settings, &overlay, &interfaces));
     let mut lost = read.lost;
     let (mappings, wrong) = mappings(source, &settings, read_file, &mut lost);
     problems.extend(wrong);
+    let listeners: Vec<_> =
+        listeners::of(&settings).into_iter().map(|each| (each.at, each.owner.to_owned())).collect();
     let installation = Installation {
         gateway: &settings.gateway.name,
         gateway_unit_id: settings.modbus.gateway_unit_id,
@@ -61,25 +69,69 @@ pub fn load(
         buses: &settings.bus,
         nodes: &settings.node,
         mappings: &mappings,
+        listeners: &listeners,
         lost: &lost,
     };
     match build(&installation) {
         Ok((table, mut warnings)) if problems.is_empty() => {
+            let (access, told) = Access::build(source, &settings.access, &table);
+            let (wrong, told): (Vec<_>, _) =
+                told.into_iter().partition(|each| each.severity == Severity::Error);
+            if !wrong.is_empty() {
+                return Err(sort_problems(wrong));
+            }
+            warnings.extend(told);
             if settings.node.is_empty() {
                 let hint = "add a [node.NAME] with `bus`, `id` and `mapping`";
                 warnings.push(source.warning(&(0..0), "there is no node, so there is nothing to show", hint));
             }
-            if let Some(message) = settings.cia309.warning() {
-                let place = locate(source, &["cia309", "listen"]);
-                warnings.push(source.warning(&place, message, "without `writes` nothing can be changed"));
-            }
-            Ok(Loaded { settings, interfaces, table, warnings })
+            warnings.extend(within_reach(source, &settings));
+            warnings.extend(of_the_page(source, &settings));
+            warnings.extend(without_broker(source, &settings));
+            Ok(Loaded { settings, interfaces, table, access, warnings })
         }
         Ok((_, more)) | Err(more) => {
             problems.extend(more);
             Err(sort_problems(problems))
         }
     }
+}
+
+/// Lines that are to be written to by MQTT, which there is none of.
+fn without_broker(source: &SourceText, settings: &Settings) -> Vec<Diagnostic> {
+    let channels = settings.node.values().flat_map(|node| node.channel.values());
+    let written = channels.map(|channel| &channel.mqtt_write);
+    let written = written.filter(|write| write.value && settings.mqtt.is_none());
+    let told = written.map(|at| {
+        let message = "`mqtt_write` means nothing without [mqtt]";
+        source.warning(&at.span, message, "add [mqtt] with the `url` of a broker, or leave it out")
+    });
+    told.collect()
+}
+
+/// What others than this host can do without a login.
+fn within_reach(source: &SourceText, settings: &Settings) -> Vec<Diagnostic> {
+    let objects = (["cia309", "listen"], settings.cia309.warning());
+    let reference = (["modbus", "canopen_objects"], settings.modbus.warning());
+    let password = (["mqtt", "password_file"], settings.mqtt.as_ref().and_then(MqttSettings::warning));
+    let roles = (["modbus", "security"], settings.modbus.security.warning());
+    let told = [reference, objects, password, roles].into_iter();
+    told.filter_map(|(place, warning)| {
+        let (message, hint) = warning?;
+        Some(source.warning(&locate(source, &place), message, hint))
+    })
+    .collect()
+}
+
+/// Logins that others hear, and logins that get nowhere.
+fn of_the_page(source: &SourceText, settings: &Settings) -> Vec<Diagnostic> {
+    let entries = || settings.access.values();
+    let known = KnownBy {
+        token: entries().any(|entry| entry.token_file.is_some()),
+        password: entries().any(|entry| entry.password.is_some() || entry.password_file.is_some()),
+    };
+    let told = settings.http.warnings(known).into_iter();
+    told.map(|(key, message, hint)| source.warning(&locate(source, &["http", key]), message, hint)).collect()
 }
 
 /// What the rooms' settings say of themselves, and what only holds for several of them together.
@@ -105,6 +157,18 @@ fn check(source: &SourceText, settings: &Settings, overlay: &Overlay) -> Vec<Dia
     }
     for (key, message, hint) in settings.cia309.problems() {
         tell("cia309", key, message, hint);
+    }
+    for (key, message, hint) in settings.modbus.security.problems() {
+        problems.push(match overlay.variable("modbus", &format!("security__{key}")) {
+            Some(variable) => environment::problem(variable, message, hint),
+            None => source.error(&locate(source, &["modbus", "security", key]), message, hint),
+        });
+    }
+    if let Some((key, message, hint)) = settings.http.tls.problem() {
+        problems.push(match overlay.variable("http", &format!("tls__{key}")) {
+            Some(variable) => environment::problem(variable, message, hint),
+            None => source.error(&locate(source, &["http", "tls", key]), message, hint),
+        });
     }
     for name in settings.node.keys().filter(|name| RESERVED_NODE_NAMES.contains(&name.value.as_str())) {
         let message = format!("`{}` cannot be the name of a node", name.value);
@@ -222,6 +286,24 @@ mapping = "motortech-detcon"
         assert_eq!(loaded.interfaces, [Interface::Virtual("demo".to_owned())]);
         assert!(loaded.settings.mqtt.is_none());
         assert_eq!(loaded.warnings, []);
+    }
+
+    #[test]
+    fn what_other_hosts_can_do_is_warned_of_where_it_is_written() {
+        let text = format!(
+            "{TWO_ENGINES}[modbus]\nlisten = [\"0.0.0.0:5020\"]\ncanopen_objects = \"read\"\n\
+             [cia309]\nlisten = \"0.0.0.0:60000\"\n"
+        );
+        let warnings = read(&text, &[]).unwrap().warnings;
+        let warnings: Vec<String> = warnings.iter().map(ToString::to_string).collect();
+        assert_eq!(warnings.len(), 2, "{warnings:#?}");
+        let expected = [
+            "etc/cangate.toml:17:19: warning: whoever reaches 0.0.0.0:5020 can read every object by",
+            "etc/cangate.toml:19:10: warning: whoever reaches 0.0.0.0:60000 can read every object without",
+        ];
+        for (warning, begin) in warnings.iter().zip(expected) {
+            assert!(warning.starts_with(begin), "{warning}");
+        }
     }
 
     #[test]

@@ -6,12 +6,11 @@ use super::Gateway;
 use super::node::{BootTrouble, Node};
 use super::tags::CarrierIndex;
 use super::units::{Finding, What};
-use crate::can::CanId;
 use crate::canopen::boot::{BootEvent, BootFailure, MappedPdo};
 use crate::canopen::object::ObjectId;
 use crate::canopen::sdo::SdoError;
 use crate::canopen::{PdoIndex, Role, cob_id};
-use crate::mapping::DEVICE_UNIT;
+use crate::mapping::{DEVICE_UNIT, NodeDef};
 use crate::process_image::{NodeIndex, Quality, Reason};
 use crate::time::Now;
 
@@ -22,7 +21,12 @@ impl Gateway {
     /// Takes an event of the boot of a node.
     pub(super) fn boot_event(&mut self, at: (Now, NodeIndex), told: &BootEvent) {
         match told {
-            BootEvent::Object { object, data } => self.learn(at, *object, data.as_deref()),
+            BootEvent::Object { object, data } => {
+                if *object == EMERGENCY_ID {
+                    self.tell_of_emergency_id(at, data.as_deref());
+                }
+                self.learn(at, *object, data.as_deref());
+            }
             // What was written is counted, and told of when all is done.
             BootEvent::Wrote { .. } => {}
             BootEvent::Refused { object, error } => self.tell(at, "setting_refused", |event| {
@@ -68,15 +72,12 @@ impl Gateway {
             return;
         };
         for (place, watch) in node.watches.iter_mut().enumerate() {
-            watch.withheld = def.canopen.boot.asks_about(PdoIndex(place));
+            watch.withheld = def.protocol.boot().is_some_and(|boot| boot.asks_about(PdoIndex(place)));
         }
     }
 
     /// The device said what is in an object: a unit, perhaps.
-    fn learn(&mut self, at: (Now, NodeIndex), object: ObjectId, data: Option<&[u8]>) {
-        if object == EMERGENCY_ID {
-            self.tell_of_emergency_id(at, data);
-        }
+    pub(super) fn learn(&mut self, at: (Now, NodeIndex), object: ObjectId, data: Option<&[u8]>) {
         for Finding { tag, what } in self.tags.units().learn(at.1, object, data) {
             let Some(def) = self.table.tag(tag) else { continue };
             let (tag, wanted) = (def.name.clone(), def.unit.clone());
@@ -102,7 +103,7 @@ impl Gateway {
     /// A TPDO that the device maps otherwise than the mapping file carries nobody knows what: its tags are withheld.
     fn mapped(&mut self, at: (Now, NodeIndex), mapped: &MappedPdo) {
         let (now, index) = at;
-        let boot = self.table.nodes.get(index.0).map(|def| &def.canopen.boot);
+        let boot = self.table.nodes.get(index.0).and_then(|def| def.protocol.boot());
         let adopts = boot.and_then(|boot| boot.adopts(mapped.pdo));
         let wanted = boot.and_then(|boot| boot.setup_of(mapped.pdo));
         let differs = adopts.is_none() && wanted.is_some_and(|wanted| wanted.maps != mapped.maps);
@@ -134,23 +135,33 @@ impl Gateway {
         }
     }
 
-    /// Emergency messages with another identifier than that of the mapping, or of CiA 301, are told of (R-DST-119).
+    /// Emergency messages with another identifier than that of the mapping, or of CiA 301, are heard all the same, and told
+    /// of (R-DST-119).
     fn tell_of_emergency_id(&mut self, at: (Now, NodeIndex), data: Option<&[u8]>) {
-        let Some(def) = self.table.nodes.get(at.1.0) else { return };
-        let settings = &def.canopen;
+        let settings = self.table.nodes.get(at.1.0).and_then(NodeDef::canopen);
+        let Some(settings) = settings else { return };
         let expected = settings.emergency.unwrap_or_else(|| cob_id::emcy(settings.id));
-        let Some(found) = data.and_then(|data| <[u8; 4]>::try_from(data).ok()).map(u32::from_le_bytes) else {
+        let Some(told) = data.and_then(|data| <[u8; 4]>::try_from(data).ok()).map(u32::from_le_bytes) else {
             return;
         };
-        let frame = if matches!(expected, CanId::Extended(_)) { 1 << 29 } else { 0 };
-        if expected.raw() | frame != found {
-            self.tell(at, "emergency_id_differs", |event| {
-                event.text = format!(
-                    "the device has 0x{found:X} in {EMERGENCY_ID} for its emergency messages, not {expected}: they are not \
-                     heard"
-                );
-            });
+        let found = cob_id::in_use(told);
+        if found == Some(expected) {
+            return;
         }
+        self.tell(at, "emergency_id_differs", |event| {
+            event.from = expected.to_string();
+            event.to = found.map_or_else(String::new, |found| found.to_string());
+            event.text = match found {
+                Some(found) => {
+                    format!(
+                        "the device sends its emergency messages as {found}, not as {expected}; that is used"
+                    )
+                }
+                None => {
+                    format!("the device has its emergency messages switched off ({EMERGENCY_ID}, bit 31)")
+                }
+            };
+        });
     }
 
     /// A TPDO is taken as the device has it (R-DST-024).
@@ -172,7 +183,7 @@ impl Gateway {
 
     /// An identifier that is not the one of the mapping file is used all the same, and told (R-DST-119).
     fn tell_of_identifier(&mut self, at: (Now, NodeIndex), mapped: &MappedPdo) {
-        let settings = self.table.nodes.get(at.1.0).and_then(|def| def.canopen.pdos.get(mapped.pdo.0));
+        let settings = self.table.nodes.get(at.1.0).and_then(|def| def.pdos().get(mapped.pdo.0));
         let expected = settings.map(|pdo| pdo.cob_id);
         if let (Some(found), Some(expected)) = (mapped.cob_id, expected)
             && found != expected
@@ -192,9 +203,10 @@ impl Gateway {
         for (place, def) in table.nodes.iter().enumerate() {
             let index = NodeIndex(place);
             let passive = table.buses.get(def.bus.0).is_none_or(|bus| bus.role == Role::Passive)
-                || def.canopen.sdo.is_none();
-            for pdo in (0..def.canopen.pdos.len()).map(PdoIndex).filter(|_| passive) {
-                if let (Some(_), Some(setup)) = (def.canopen.boot.adopts(pdo), def.canopen.boot.setup_of(pdo))
+                || !def.protocol.has_sdo();
+            for pdo in (0..def.pdos().len()).map(PdoIndex).filter(|_| passive) {
+                if let Some(boot) = def.protocol.boot()
+                    && let (Some(_), Some(setup)) = (boot.adopts(pdo), boot.setup_of(pdo))
                 {
                     self.tags.adopt(index, pdo, &setup.maps);
                 }
@@ -225,10 +237,10 @@ impl Gateway {
         let (Some(def), Some(node)) = (self.table.nodes.get(index.0), self.nodes.get(index.0)) else {
             return;
         };
-        let carrier = CarrierIndex(def.canopen.pdos.len() + poll);
+        let carrier = CarrierIndex(def.pdos().len() + poll);
         // Of fewer bytes than its type has, no value can be made.
-        let length = def.canopen.polls.get(poll).map_or(0, |poll| poll.length);
-        let object = def.canopen.polls.get(poll).map(|poll| poll.object);
+        let length = def.protocol.polls().get(poll).map_or(0, |poll| poll.length);
+        let object = def.protocol.polls().get(poll).map(|poll| poll.object);
         if let Some(data) = result.as_ref().ok().filter(|data| data.len() >= length) {
             let quality = node.quality_of_new_data(false, false);
             self.tags.apply(&self.table, now, (index, carrier), data, quality);

@@ -1,20 +1,18 @@
-//! One bus: its link, its silence, its counters, and what happens on it that concerns no configured node.
+//! One bus: its link, its frames, its counters. Its silence is in [`silence`](super::silence), what is nobody's in
+//! [`foreign`](super::foreign).
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use super::events::Name;
-use super::node::Node;
-use super::{Gateway, Output};
+use super::silence::{SILENCE, silence};
+use super::{Gateway, Output, modules};
 use crate::can::{BusCounters, BusIndex, CanFrame, CanId, Link};
-use crate::canopen::{
-    ErrorControl, ForeignEvent, Network, NetworkOutput, NetworkSettings, NodeId, NodeSettings, Role, cob_id,
-};
-use crate::mapping::{AlarmOwner, BuiltIn, NodeDef, TagTable};
+use crate::canopen::{Network, NetworkOutput, NetworkSettings, NodeSettings, Role};
+use crate::esd;
+use crate::mapping::{AlarmOwner, BuiltIn, TagTable};
 use crate::process_image::{BusState, BusStatus, Event, NodeIndex, Quality, Reason, Value};
 use crate::time::{Instant, Now};
-
-/// A bus is silent when nobody sent anything for this long (B03), or longer where its nodes speak more seldom.
-const SILENCE: Duration = Duration::from_millis(1_500);
 
 /// The load is too high above this many tenths of a percent (B06).
 const HIGH_LOAD_PERMILLE: u16 = 800;
@@ -26,28 +24,34 @@ const RATE_INTERVAL: Duration = Duration::from_millis(500);
 #[derive(Debug)]
 pub(super) struct Bus {
     pub(super) network: Network,
+    /// Those of its nodes that are esd modules.
+    pub(super) modules: esd::Network,
+    /// By [`esd::ModuleIndex`].
+    pub(super) module_nodes: Vec<NodeIndex>,
+    /// Identifiers of what goes to serial lines.
+    pub(super) line_ids: BTreeSet<CanId>,
     pub(super) status: BusStatus,
-    role: Role,
-    link: Option<Link>,
+    pub(super) role: Role,
+    pub(super) link: Option<Link>,
     /// By node id.
-    by_id: Vec<Option<NodeIndex>>,
-    members: Vec<NodeIndex>,
+    pub(super) by_id: Vec<Option<NodeIndex>>,
+    pub(super) members: Vec<NodeIndex>,
     /// When a frame came last, or since when frames can come.
-    heard_at: Instant,
-    ever_heard: bool,
-    silent: bool,
+    pub(super) heard_at: Instant,
+    pub(super) ever_heard: bool,
+    pub(super) silent: bool,
     /// Silence is not looked for before so much of it, whichever nodes are expected.
-    shortest_silence: Duration,
+    pub(super) shortest_silence: Duration,
     /// When it is looked for next, if no frame comes until then.
-    look_at: Instant,
+    pub(super) look_at: Instant,
     /// When frames came again after the bus was silent or could not be used.
-    back_at: Option<Instant>,
-    counters: BusCounters,
-    counted_at: Option<Instant>,
+    pub(super) back_at: Option<Instant>,
+    pub(super) counters: BusCounters,
+    pub(super) counted_at: Option<Instant>,
     /// Frames for which the queue to the bus was full.
-    refused: u64,
+    pub(super) refused: u64,
     /// 29-bit and remote frames on identifiers of configured nodes, and frames of unknown identifiers.
-    foreign: u64,
+    pub(super) foreign: u64,
 }
 
 impl Bus {
@@ -58,14 +62,21 @@ impl Bus {
         let mut members = Vec::new();
         let mut nodes: Vec<NodeSettings> = Vec::new();
         for (place, node) in table.nodes.iter().enumerate().filter(|(_, node)| node.bus == index) {
-            if let Some(entry) = by_id.get_mut(usize::from(node.canopen.id.get())) {
+            members.push(NodeIndex(place));
+            let Some(canopen) = node.canopen() else { continue };
+            if let Some(entry) = by_id.get_mut(usize::from(canopen.id.get())) {
                 *entry = Some(NodeIndex(place));
             }
-            members.push(NodeIndex(place));
-            nodes.push(node.canopen.clone());
+            nodes.push(canopen.clone());
         }
-        let shortest_silence = silence(nodes.iter()).unwrap_or(SILENCE);
+        let of_bus = table.nodes.iter().filter(|node| node.bus == index);
+        let shortest_silence = silence(of_bus).unwrap_or(SILENCE);
+        let (module_settings, module_nodes) = modules::settings(table, index);
+        let channels = module_settings.modules.iter().flat_map(|module| &module.channels);
         Self {
+            line_ids: channels.map(|channel| channel.rx_id).collect(),
+            modules: esd::Network::new(module_settings, now),
+            module_nodes,
             network: Network::new(
                 NetworkSettings {
                     role,
@@ -119,31 +130,6 @@ impl Bus {
     }
 }
 
-/// How long a node that is well can be silent.
-fn longest_silence(node: &NodeSettings) -> Option<Duration> {
-    match &node.error_control {
-        ErrorControl::Guarding(guarding) if !guarding.guard_time.is_zero() => Some(guarding.guard_time * 3),
-        ErrorControl::Heartbeat { timeout } => Some(*timeout),
-        ErrorControl::Guarding(_) | ErrorControl::None => {
-            node.pdos.iter().filter_map(|pdo| pdo.timeout).min()
-        }
-    }
-}
-
-/// How long a bus with these nodes can be silent: until two of them should have been heard, since the silence of one
-/// is its own. `None` where there are no two.
-fn silence<'a>(nodes: impl Iterator<Item = &'a NodeSettings>) -> Option<Duration> {
-    let (mut shortest, mut second) = (None, None);
-    for silence in nodes.filter_map(longest_silence) {
-        if shortest.is_none_or(|shortest| silence < shortest) {
-            second = shortest.replace(silence);
-        } else if second.is_none_or(|second| silence < second) {
-            second = Some(silence);
-        }
-    }
-    second.map(|second| second.max(SILENCE))
-}
-
 impl Gateway {
     /// Why a bus cannot be used; `None` where it can.
     pub(super) fn bus_trouble(&self, index: BusIndex) -> Option<String> {
@@ -162,51 +148,6 @@ impl Gateway {
         self.buses.get(index.0).is_some_and(Bus::is_known_down)
     }
 
-    /// While the loss of a node may turn out to be the silence of its bus, or the node may only be slow to come back
-    /// after that: until when that is decided.
-    pub(super) fn undecided_until(&self, now: Now, node: &NodeSettings, index: BusIndex) -> Option<Instant> {
-        let bus = self.buses.get(index.0)?;
-        let back = bus.back_at.map(|at| at + longest_silence(node).unwrap_or(SILENCE));
-        self.silent_from(now, index).max(back).filter(|until| *until > now.instant)
-    }
-
-    /// While a bus has been quiet for so long that it may be silent altogether: from when on it will be.
-    fn silent_from(&self, now: Now, index: BusIndex) -> Option<Instant> {
-        let bus = self.buses.get(index.0)?;
-        let quiet = now.instant.since(bus.heard_at);
-        if bus.silent_at().is_none() || quiet < bus.shortest_silence / 2 {
-            return None;
-        }
-        let silence = self.silence_of(bus)?;
-        (quiet >= silence / 2).then_some(bus.heard_at + silence).filter(|at| *at > now.instant)
-    }
-
-    /// How long a bus can be silent; `None` unless at least two nodes should be heard all the time. The silence of a
-    /// single one is that node's own, and its own alarm tells of it better. So is that of a node that was missing
-    /// already while others were heard.
-    fn silence_of(&self, bus: &Bus) -> Option<Duration> {
-        let expected = bus.members.iter().filter_map(|index| {
-            let def: &NodeDef = self.table.nodes.get(index.0)?;
-            let node: &Node = self.nodes.get(index.0)?;
-            let missing = node.is_missing() && node.missing_since <= Some(bus.heard_at);
-            (!missing && node.is_expected(def)).then_some(&def.canopen)
-        });
-        silence(expected)
-    }
-
-    /// Frames come again, or can come again, after nobody could be heard. What was known of the nodes' absence says
-    /// nothing any more: each has the time that it may be silent for to show itself, and until then the end of the
-    /// bus's own alarm does not raise theirs.
-    fn begin_anew(&mut self, now: Now, index: BusIndex) {
-        let Some(bus) = self.buses.get_mut(index.0) else { return };
-        bus.back_at = Some(now.instant);
-        for node in bus.members.clone() {
-            let owner = AlarmOwner::Node(node);
-            self.conditions.set(now, owner, BuiltIn::NodeLost, false);
-            self.conditions.set(now, owner, BuiltIn::NodeNeverSeen, false);
-        }
-    }
-
     pub(super) fn bus_frame(&mut self, now: Now, index: BusIndex, frame: &CanFrame) {
         let was_quiet = self.silent_from(now, index).is_some();
         let Some(bus) = self.buses.get_mut(index.0) else { return };
@@ -219,7 +160,11 @@ impl Gateway {
             self.tell_bus(now, index, "bus_heard", |_| ());
         }
         if let Some(bus) = self.buses.get_mut(index.0) {
-            bus.network.handle_frame(now, frame);
+            if bus.modules.owns(frame.id()) {
+                bus.modules.handle_frame(now, frame);
+            } else {
+                bus.network.handle_frame(now, frame);
+            }
         }
         self.drain_network(now, index);
         if was_quiet || was_silent {
@@ -239,6 +184,7 @@ impl Gateway {
         if up != was_up {
             bus.listen_from(now.instant);
             bus.network.handle_link(now, up);
+            bus.modules.handle_link(now, up);
         }
         let never_heard = !bus.ever_heard;
         let members = if up { Vec::new() } else { bus.members.clone() };
@@ -268,6 +214,7 @@ impl Gateway {
                 node.lose_contact();
             }
             self.degrade(now, node, None, Quality::Bad(Reason::BusUnavailable));
+            self.show_module_lines((now, node));
         }
         self.drain_network(now, index);
         self.refresh_nodes_of(now, index);
@@ -275,15 +222,32 @@ impl Gateway {
 
     pub(super) fn bus_not_sent(&mut self, now: Now, index: BusIndex, frame: &CanFrame) {
         let Some(bus) = self.buses.get_mut(index.0) else { return };
-        bus.network.handle_not_sent(now, frame);
+        if bus.modules.owns(frame.id()) {
+            bus.modules.handle_not_sent(now, frame);
+        } else {
+            bus.network.handle_not_sent(now, frame);
+        }
         self.tell_bus(now, index, "frame_not_sent", |event| {
             event.text = format!("{frame} did not leave");
         });
         self.drain_network(now, index);
     }
 
+    /// Whether a frame carries bytes for a serial line: they can wait, and are to leave room for what cannot.
+    #[must_use]
+    pub fn can_wait(&self, index: BusIndex, frame: &CanFrame) -> bool {
+        self.buses.get(index.0).is_some_and(|bus| bus.line_ids.contains(&frame.id()))
+    }
+
     /// The queue of frames to a bus is full.
     pub(super) fn bus_refused(&mut self, now: Now, index: BusIndex, frame: &CanFrame) {
+        if self.can_wait(index, frame) {
+            // It is tried again soon: nothing is lost.
+            if let Some(bus) = self.buses.get_mut(index.0) {
+                bus.modules.handle_not_sent(now, frame);
+            }
+            return self.drain_modules(now, index);
+        }
         if let Some(bus) = self.buses.get_mut(index.0) {
             bus.refused = bus.refused.saturating_add(1);
             bus.status.frames_not_sent = bus.status.frames_not_sent.saturating_add(1);
@@ -344,39 +308,27 @@ impl Gateway {
         }
     }
 
-    /// Looks whether a bus has fallen silent.
-    pub(super) fn check_silence(&mut self, now: Now, index: BusIndex) {
-        let Some(bus) = self.buses.get(index.0) else { return };
-        if bus.silent_at().is_none_or(|at| at > now.instant) {
-            return;
-        }
-        let silence = self.silence_of(bus);
+    /// The one way out: what the configuration does not allow is dropped. In the passive role that is everything.
+    pub(super) fn transmit(&mut self, index: BusIndex, frame: CanFrame) {
         let Some(bus) = self.buses.get_mut(index.0) else { return };
-        match silence {
-            Some(silence) if bus.heard_at + silence <= now.instant => {
-                bus.silent = true;
-                self.conditions.set(now, AlarmOwner::Bus(index), BuiltIn::BusSilent, true);
-                self.tell_bus(now, index, "bus_silent", |event| {
-                    event.text = format!("no frame from anyone for {silence:?}");
-                });
-            }
-            Some(silence) => bus.look_at = bus.heard_at + silence,
-            None => bus.look_at = now.instant + bus.shortest_silence,
+        if let Some(kind) = self.allowed.permit(index, &frame) {
+            bus.status.sent.count(kind);
+            self.outputs.push_back(Output::Transmit { bus: index, frame });
+        } else if bus.role == Role::Master {
+            bus.status.frames_blocked = bus.status.frames_blocked.saturating_add(1);
+            self.dirty_buses.mark(index.0);
+            let bus = self.table.buses.get(index.0).map_or("", |bus| bus.name.as_str());
+            tracing::error!(bus, %frame, "not sent, because the configuration does not allow it: this is a bug in cangate");
         }
-        self.refresh_nodes_of(now, index);
     }
 
-    /// Takes what a network has to say.
+    /// Takes what the networks of a bus have to say.
     pub(super) fn drain_network(&mut self, now: Now, index: BusIndex) {
         while let Some(bus) = self.buses.get_mut(index.0)
             && let Some(output) = bus.network.poll_output()
         {
             match output {
-                // A passive gateway sends nothing at all, whatever anyone asks for.
-                NetworkOutput::Transmit(_) if bus.role == Role::Passive => {}
-                NetworkOutput::Transmit(frame) => {
-                    self.outputs.push_back(Output::Transmit { bus: index, frame });
-                }
+                NetworkOutput::Transmit(frame) => self.transmit(index, frame),
                 NetworkOutput::Node(id, event) => {
                     if let Some(Some(node)) = bus.by_id.get(usize::from(id.get())).copied() {
                         self.node_event(now, node, &event);
@@ -385,97 +337,7 @@ impl Gateway {
                 NetworkOutput::Foreign(event) => self.foreign_event(now, index, &event),
             }
         }
-    }
-
-    /// A frame that belongs to nobody used an identifier of a node.
-    pub(super) fn count_foreign_frame_of(&mut self, node: NodeIndex) {
-        if let Some(def) = self.table.nodes.get(node.0) {
-            self.count_foreign_frame(def.bus);
-        }
-    }
-
-    pub(super) fn count_foreign_frame(&mut self, index: BusIndex) {
-        if let Some(bus) = self.buses.get_mut(index.0) {
-            bus.foreign = bus.foreign.saturating_add(1);
-            bus.status.foreign_frames = bus.status.foreign_frames.saturating_add(1);
-            self.dirty_buses.mark(index.0);
-        }
-    }
-
-    fn foreign_event(&mut self, now: Now, index: BusIndex, event: &ForeignEvent) {
-        match event {
-            ForeignEvent::NmtCommand { command, node } => {
-                self.foreign_master(now, index);
-                self.tell_bus(now, index, "foreign_nmt_command", |event| {
-                    event.value = Some(Value::Unsigned((*command).into()));
-                    event.text =
-                        format!("somebody else sent NMT command 0x{command:02X} to node {node} (0 = all)");
-                });
-            }
-            ForeignEvent::Sync { produced, first } => {
-                // Somebody who was told of is nobody to tell of.
-                let def = self.table.buses.get(index.0);
-                if *produced || def.is_none_or(|bus| bus.sync.is_none()) {
-                    self.foreign_broadcast(now, index, "SYNC", *produced, *first);
-                }
-            }
-            ForeignEvent::Time { produced, first } => {
-                self.foreign_broadcast(now, index, "TIME", *produced, *first);
-            }
-            ForeignEvent::Lss => {
-                self.foreign_master(now, index);
-                self.tell_bus(now, index, "foreign_lss", |event| {
-                    event.text =
-                        "somebody else looks for devices by LSS, or changes a node id or bit rate".into();
-                });
-            }
-            ForeignEvent::UnknownId { id, node, first } => {
-                self.count_foreign_frame(index);
-                if *first {
-                    let node = *node;
-                    let known = node.is_some_and(|node| self.is_configured(index, node));
-                    self.tell_bus(now, index, "unknown_id", |event| {
-                        event.value = Some(Value::Unsigned(id.raw().into()));
-                        event.text = stranger(*id, node, known);
-                    });
-                }
-            }
-        }
-    }
-
-    /// SYNC or TIME of somebody else: of a second producer, or of one that the configuration does not know.
-    fn foreign_broadcast(
-        &mut self,
-        now: Now,
-        index: BusIndex,
-        what: &'static str,
-        produced: bool,
-        first: bool,
-    ) {
-        self.count_foreign_frame(index);
-        if produced {
-            self.conditions.pulse(now, AlarmOwner::Bus(index), BuiltIn::ForeignProducer);
-            let name = if what == "SYNC" { "foreign_sync" } else { "foreign_time" };
-            self.tell_bus(now, index, name, |event| {
-                event.text = format!("somebody else sends {what}, which this gateway sends too");
-            });
-        } else if first {
-            self.tell_bus(now, index, "unknown_id", |event| {
-                event.text = format!("{what} comes from somebody else");
-            });
-        }
-    }
-
-    /// Somebody else does what a master does. In the passive role that is as it should be.
-    pub(super) fn foreign_master(&mut self, now: Now, index: BusIndex) {
-        if self.buses.get(index.0).is_some_and(|bus| bus.role == Role::Master) {
-            self.conditions.pulse(now, AlarmOwner::Bus(index), BuiltIn::ForeignMaster);
-        }
-    }
-
-    fn is_configured(&self, index: BusIndex, node: NodeId) -> bool {
-        let bus = self.buses.get(index.0);
-        bus.and_then(|bus| bus.by_id.get(usize::from(node.get()))).is_some_and(Option::is_some)
+        self.drain_modules(now, index);
     }
 
     pub(super) fn refresh_nodes_of(&mut self, now: Now, index: BusIndex) {
@@ -484,39 +346,20 @@ impl Gateway {
             let member = self.buses.get(index.0).and_then(|bus| bus.members.get(place)).copied();
             if let Some(member) = member {
                 self.refresh_node(now, member);
+                self.refresh_lines((now, member));
             }
         }
     }
 
-    fn tell_bus(&mut self, now: Now, index: BusIndex, name: &'static str, fill: impl FnOnce(&mut Event)) {
+    pub(super) fn tell_bus(
+        &mut self,
+        now: Now,
+        index: BusIndex,
+        name: &'static str,
+        fill: impl FnOnce(&mut Event),
+    ) {
         self.events.record(now, AlarmOwner::Bus(index), Name::Word(name), fill);
     }
-}
-
-/// What the first frame of an identifier of nobody's may mean. `known`: its node id is that of a configured node.
-fn stranger(id: CanId, node: Option<NodeId>, known: bool) -> String {
-    let Some(node) = node else { return format!("{id} belongs to no configured node") };
-    if known && is_rpdo(id) {
-        return format!("somebody else sends node {node} process data, {id}");
-    }
-    if known {
-        return format!(
-            "{id} stands for node {node}, but the mapping of that node does not know it: it leaves something out, or \
-             another device has the same node id"
-        );
-    }
-    if id == cob_id::error_control(node) {
-        return format!(
-            "{id} is a heartbeat, boot-up message or guard request of node {node}, which is not configured: another \
-             master, or a device that the configuration leaves out"
-        );
-    }
-    format!("{id} comes from node {node}, which is not configured")
-}
-
-/// Whether an identifier is that of an RPDO of the predefined connection set: what a master sends its nodes.
-fn is_rpdo(id: CanId) -> bool {
-    matches!(id, CanId::Standard(id) if matches!(id >> 7, 4 | 6 | 8 | 10))
 }
 
 fn state(link: Link) -> BusState {

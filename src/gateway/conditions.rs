@@ -12,6 +12,7 @@ use crate::mapping::{AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, Derived, Exp
 use crate::process_image::{AlarmIndex, AlarmStatus, Revision, Sample, TagIndex, Value};
 use crate::time::{Instant, Now};
 
+use super::kept::Kept;
 use super::marks::Marks;
 
 /// All alarms and what raises them.
@@ -62,12 +63,24 @@ impl Conditions {
         }
     }
 
+    /// Takes over the alarms that stay.
+    pub(super) fn take_over(&mut self, old: Self, kept: &Kept, now: Now) {
+        for (holds, from) in self.holds.iter_mut().zip(&kept.alarms) {
+            if let Some(held) = from.and_then(|from| old.holds.get(from.0)) {
+                *holds = *held;
+            }
+        }
+        self.list.take_over(old.list, &kept.alarms, now);
+        self.unpublished = true;
+    }
+
     /// A condition that the gateway watches begins or ends. Nothing where the table has no such alarm.
     pub(super) fn set(&mut self, now: Now, owner: AlarmOwner, condition: BuiltIn, holds: bool) {
         self.decided(now, owner, condition, holds, None);
     }
 
-    /// The same for a condition that holds while there is a value, which is shown with its alarm.
+    /// The same for a condition that holds while there is a value, which is shown with its alarm; so is another value that
+    /// takes its place.
     pub(super) fn set_with(&mut self, now: Now, owner: AlarmOwner, condition: BuiltIn, value: Option<Value>) {
         self.decided(now, owner, condition, value.is_some(), value);
     }
@@ -86,6 +99,9 @@ impl Conditions {
         {
             *held = holds;
             self.list.set_condition(now, alarm, holds, value);
+        }
+        if let Some(value) = value {
+            self.unpublished |= self.list.set_value(alarm, value);
         }
     }
 
@@ -151,7 +167,8 @@ impl Conditions {
     /// Copies what changed since the last call; `true` where something did. A transition can change other alarms too
     /// (first-out of a group), so all of them are looked at; transitions are rare.
     pub(super) fn publish(&mut self, alarms: &mut [AlarmStatus], revision: Revision) -> bool {
-        if !std::mem::take(&mut self.unpublished) {
+        let counted = self.list.take_counted();
+        if !std::mem::take(&mut self.unpublished) && !counted {
             return false;
         }
         let mut moved = false;
@@ -193,7 +210,8 @@ fn counted(table: &TagTable, tag: TagIndex) -> &[TagIndex] {
             | Source::Polled { .. }
             | Source::Adopted { .. }
             | Source::Rpdo { .. }
-            | Source::Emergency { .. },
+            | Source::Emergency { .. }
+            | Source::Module { .. },
         )
         | None => &[],
     }

@@ -3,20 +3,25 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
+use super::allowed_frames::AllowedFrames;
 use super::bus::Bus;
 use super::conditions::Conditions;
 use super::events::{EventLog, Name};
+use super::intruders::Intruders;
+use super::lines::Lines;
 use super::marks::Marks;
 use super::node::Node;
 use super::objects::Transfers;
 use super::operate::Finished;
 use super::supply::Supply;
 use super::tags::{CarrierIndex, Tags};
-use super::{Command, Outcome};
+use super::{Command, Outcome, Refused};
 use crate::can::{BusEvent, BusIndex, CanFrame};
 use crate::canopen::{PdoIndex, Role};
 use crate::mapping::{AlarmOwner, BuiltIn, TagTable};
-use crate::process_image::{NodeIndex, ProcessImage, Quality, Revision};
+use crate::process_image::{
+    Journal, NodeIndex, ProcessImage, Quality, Revision, SerialLine, SessionTrouble, Value,
+};
 use crate::time::{Instant, Now};
 
 /// What the gateway is told.
@@ -31,9 +36,16 @@ pub enum Input {
     },
     /// A northbound asks for something.
     Command(Command),
+    /// Northbounds refused requests for want of a right.
+    Refused(Vec<Refused>),
     /// How the rest of the program is.
     Health(Health),
 }
+
+/// A certificate that is valid for fewer days is told of (G06).
+const DAYS_TO_EXPIRY: i64 = 30;
+/// And for fewer than these, urgently.
+const DAYS_TO_EXPIRY_SOON: i64 = 7;
 
 /// How the rest of the program is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -42,6 +54,14 @@ pub struct Health {
     pub mqtt_connected: Option<bool>,
     /// The wall clock is synchronised.
     pub clock_synchronised: bool,
+    /// Why there is no MQTT session, where that is known.
+    pub mqtt_trouble: Option<SessionTrouble>,
+    /// Whole days until the first certificate expires, negative once it has; `None` where there is none.
+    pub certificate_days: Option<i64>,
+    /// What is kept for the broker fills four fifths of its room.
+    pub buffer_filling: bool,
+    /// The disk that it is kept on cannot be used.
+    pub buffer_fault: bool,
 }
 
 /// What the gateway wants done.
@@ -67,12 +87,16 @@ pub enum Output {
 #[derive(Debug)]
 pub struct Gateway {
     pub(super) table: Arc<TagTable>,
+    pub(super) allowed: AllowedFrames,
     pub(super) buses: Vec<Bus>,
     pub(super) nodes: Vec<Node>,
     pub(super) tags: Tags,
     pub(super) supply: Supply,
+    pub(super) lines: Lines,
     pub(super) conditions: Conditions,
     pub(super) events: EventLog,
+    /// Number of the newest event before the start.
+    newest_event: u64,
     pub(super) health: Health,
     /// Nodes of which a tag changed, while one input is worked off.
     changed_nodes: Marks,
@@ -83,6 +107,7 @@ pub struct Gateway {
     /// Commands that are answered when all outputs were taken. No more than were asked for by one input.
     pub(super) finished: Vec<Finished>,
     pub(super) transfers: Transfers,
+    pub(super) intruders: Intruders,
     /// When alarms that are held back are to be looked at again.
     pub(super) next_look: Option<Instant>,
     /// When the data of a TPDO may be too old.
@@ -93,15 +118,34 @@ impl Gateway {
     /// A gateway that has seen nothing yet.
     #[must_use]
     pub fn new(table: Arc<TagTable>, now: Now) -> Self {
+        Self::after_event(table, now, 0)
+    }
+
+    /// The same, whose first event has the number `newest_event` + 1.
+    #[must_use]
+    pub fn after_event(table: Arc<TagTable>, now: Now, newest_event: u64) -> Self {
+        let mut gateway = Self::bare(table, now);
+        gateway.newest_event = newest_event;
+        gateway.events = EventLog::new(Arc::clone(&gateway.table), newest_event);
+        gateway.events.record(now, AlarmOwner::Gateway, Name::Word("gateway_started"), |_| ());
+        gateway.begin(now, |_| true);
+        gateway
+    }
+
+    /// Nothing was asked of its networks yet, and nothing told.
+    pub(super) fn bare(table: Arc<TagTable>, now: Now) -> Self {
         let buses = (0..table.buses.len()).map(|bus| Bus::new(&table, BusIndex(bus), now)).collect();
         let is_passive = |bus: BusIndex| table.buses.get(bus.0).is_none_or(|bus| bus.role == Role::Passive);
         let nodes: Vec<Node> = table.nodes.iter().map(|node| Node::new(node, is_passive(node.bus))).collect();
         let mut gateway = Self {
+            allowed: AllowedFrames::new(&table),
             buses,
             tags: Tags::new(&table, now),
             supply: Supply::new(&table),
+            lines: Lines::new(&table, now),
             conditions: Conditions::new(&table),
-            events: EventLog::new(Arc::clone(&table)),
+            events: EventLog::new(Arc::clone(&table), 0),
+            newest_event: 0,
             health: Health::default(),
             changed_nodes: Marks::new(nodes.len()),
             dirty_nodes: Marks::new(nodes.len()),
@@ -109,22 +153,14 @@ impl Gateway {
             outputs: VecDeque::new(),
             finished: Vec::new(),
             transfers: Transfers::default(),
+            intruders: Intruders::default(),
             next_look: None,
             next_expiry: None,
             nodes,
             table,
         };
         gateway.believe_mappings(now);
-        for (place, node) in gateway.nodes.iter_mut().enumerate() {
-            node.status.data_good = gateway.tags.all_good(NodeIndex(place));
-        }
-        gateway.events.record(now, AlarmOwner::Gateway, Name::Word("gateway_started"), |_| ());
         gateway.begin_supply(now);
-        for bus in 0..gateway.buses.len() {
-            gateway.drain_network(now, BusIndex(bus));
-            gateway.refresh_nodes_of(now, BusIndex(bus));
-        }
-        gateway.settle(now);
         gateway
     }
 
@@ -147,6 +183,8 @@ impl Gateway {
         image.units = self.tags.units_shown();
         image.nodes = self.nodes.iter().map(|node| node.status.clone()).collect();
         image.buses = self.buses.iter().map(|bus| bus.status).collect();
+        image.lines = vec![SerialLine::default(); table.lines.len()];
+        image.journal = Journal::after_number(self.newest_event);
         image
     }
 
@@ -155,6 +193,7 @@ impl Gateway {
         match input {
             Input::Bus { bus, event } => self.bus_event(bus, &event),
             Input::Command(command) => self.command(now, command),
+            Input::Refused(refused) => self.requests_refused(now, refused),
             Input::Health(health) => self.set_health(now, health),
         }
     }
@@ -179,7 +218,15 @@ impl Gateway {
                 network.handle_timeout(now);
                 self.drain_network(now, bus);
             }
+            let modules = self.buses.get_mut(bus.0).map(|bus| &mut bus.modules);
+            if let Some(modules) = modules
+                && modules.poll_timeout().is_some_and(|(due, _)| due <= now.instant)
+            {
+                modules.handle_timeout(now);
+                self.drain_modules(now, bus);
+            }
         }
+        self.look_at_lines(now);
         if self.next_look.is_some_and(|due| due <= now.instant) {
             self.next_look = None;
             for node in (0..self.nodes.len()).map(NodeIndex) {
@@ -187,6 +234,7 @@ impl Gateway {
             }
         }
         self.expire_data(now);
+        self.look_at_intruders(now);
         self.tags.handle_timeout(&self.table, now);
         self.conditions.handle_timeout(now);
         self.events.handle_timeout(now);
@@ -205,16 +253,19 @@ impl Gateway {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<(Instant, &'static str)> {
         let networks = self.buses.iter().filter_map(|bus| bus.network.poll_timeout());
+        let modules = self.buses.iter().filter_map(|bus| bus.modules.poll_timeout());
         let silences = self.buses.iter().filter_map(|bus| Some((bus.silent_at()?, "bus silence")));
         let own = [
             (self.next_look, "alarm held back"),
             (self.next_expiry, "data too old"),
             (self.tags.poll_timeout(), "next second"),
+            (self.lines.poll_timeout(), "serial lines"),
             (self.conditions.poll_timeout(), "alarm delay"),
             (self.events.poll_timeout(), "folded events"),
+            (self.intruders.poll_timeout(), "refused requests"),
         ];
         let own = own.into_iter().filter_map(|(due, why)| Some((due?, why)));
-        networks.chain(silences).chain(own).min_by_key(|(due, _)| *due)
+        networks.chain(modules).chain(silences).chain(own).min_by_key(|(due, _)| *due)
     }
 
     /// Copies all that changed since the last call into the image, and appends the new events to its journal.
@@ -237,6 +288,7 @@ impl Gateway {
                 *shown = bus.status;
             }
         }
+        moved |= self.lines.publish(image);
         moved |= self.conditions.publish(&mut image.alarms, revision);
         for event in self.events.drain() {
             image.journal.append(event);
@@ -285,6 +337,8 @@ impl Gateway {
             self.events.record(now, AlarmOwner::Gateway, Name::Word("mqtt"), |event| {
                 word(before.mqtt_connected).clone_into(&mut event.from);
                 word(health.mqtt_connected).clone_into(&mut event.to);
+                let trouble = health.mqtt_trouble.filter(|_| health.mqtt_connected == Some(false));
+                trouble.map(SessionTrouble::meaning).unwrap_or_default().clone_into(&mut event.text);
             });
         }
         for bus in (0..self.buses.len()).map(BusIndex) {
@@ -292,9 +346,31 @@ impl Gateway {
                 bus.network.handle_clock(now, health.clock_synchronised);
             }
         }
-        let down = health.mqtt_connected == Some(false);
-        self.conditions.set(now, AlarmOwner::Gateway, BuiltIn::MqttDown, down);
+        self.judge_health(now, health);
         self.settle(now);
+    }
+
+    /// The alarms of the gateway itself.
+    fn judge_health(&mut self, now: Now, health: Health) {
+        let down = health.mqtt_connected == Some(false);
+        match health.mqtt_trouble.filter(|_| down) {
+            Some(trouble) => {
+                let why = Some(Value::Unsigned(trouble.code().into()));
+                self.conditions.set_with(now, AlarmOwner::Gateway, BuiltIn::MqttDown, why);
+            }
+            None => self.conditions.set(now, AlarmOwner::Gateway, BuiltIn::MqttDown, down),
+        }
+        self.conditions.set(now, AlarmOwner::Gateway, BuiltIn::BufferFilling, health.buffer_filling);
+        self.conditions.set(now, AlarmOwner::Gateway, BuiltIn::BufferFault, health.buffer_fault);
+        let days = health.certificate_days;
+        for (condition, range) in [
+            (BuiltIn::CertificateExpires, DAYS_TO_EXPIRY_SOON..DAYS_TO_EXPIRY),
+            (BuiltIn::CertificateExpiresSoon, 0..DAYS_TO_EXPIRY_SOON),
+            (BuiltIn::CertificateExpired, i64::MIN..0),
+        ] {
+            let left = days.filter(|days| range.contains(days)).map(Value::Signed);
+            self.conditions.set_with(now, AlarmOwner::Gateway, condition, left);
+        }
     }
 
     /// The tags of a node, or of one of its TPDOs, can be trusted less.

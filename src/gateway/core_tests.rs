@@ -234,7 +234,7 @@ fn a_command_whose_frame_finds_the_queue_full_is_answered_busy() {
     let mut bench = Bench::new(fixture::table());
     bench.link(0, Link::ErrorActive);
     let action = Action::Nmt { node: ENGINE1, request: crate::canopen::NmtRequest::Stop };
-    let command = Command { id: 3, source: CommandSource::Web("test".into()), action };
+    let command = Command { id: 3, source: CommandSource::web("test".into()), action };
     let now = Now::from_millis(50);
     bench.gateway.handle_input(now, Input::Command(command));
     let mut outcomes = Vec::new();

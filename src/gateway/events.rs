@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use super::refusals::{Refusals, Report};
 use crate::alarms::Transition;
 use crate::mapping::{AlarmOwner, TagTable};
 use crate::process_image::{Event, EventKind, TagIndex};
@@ -37,6 +38,7 @@ pub(super) struct EventLog {
     pending: Vec<Event>,
     windows: BTreeMap<Key, Window>,
     next_flush: Option<Instant>,
+    refusals: Refusals,
 }
 
 #[derive(Debug)]
@@ -50,8 +52,33 @@ struct Window {
 }
 
 impl EventLog {
-    pub(super) fn new(table: Arc<TagTable>) -> Self {
-        Self { table, newest: 0, pending: Vec::new(), windows: BTreeMap::new(), next_flush: None }
+    /// The first event will have the number `newest` + 1.
+    pub(super) fn new(table: Arc<TagTable>, newest: u64) -> Self {
+        let (pending, windows, refusals) = (Vec::new(), BTreeMap::new(), Refusals::default());
+        Self { table, newest, pending, windows, next_flush: None, refusals }
+    }
+
+    /// Goes on counting where another log stopped. What that still counted is to be flushed before.
+    pub(super) fn take_over(&mut self, old: &Self) {
+        self.newest = old.newest;
+    }
+
+    /// The next events have numbers that are so much higher. Those before have been [drained](Self::drain).
+    pub(super) fn number_higher(&mut self, by: u64) {
+        self.newest += by;
+    }
+
+    /// Journals all counts at once, before their time.
+    pub(super) fn flush(&mut self, now: Now) {
+        for report in self.refusals.take_all() {
+            self.record_request(now, report);
+        }
+        let folded: Vec<Key> =
+            self.windows.iter().filter(|(_, window)| window.folded > 0).map(|(key, _)| *key).collect();
+        for key in folded {
+            self.close_window(now, key);
+        }
+        self.next_flush = None;
     }
 
     /// Something happened to a node, a bus or the gateway. `fill` completes the event; of those that are folded into a
@@ -102,22 +129,28 @@ impl EventLog {
         });
     }
 
-    /// Somebody asked for something. Never folded: the queue of commands is bounded.
-    pub(super) fn record_command(
-        &mut self,
-        now: Now,
-        about: AlarmOwner,
-        name: &'static str,
-        fill: impl FnOnce(&mut Event),
-    ) {
-        self.push(now, about, Name::Word(name), |event| {
-            event.kind = EventKind::Command;
-            fill(event);
+    /// Somebody asked for something, and it was done or may have been. Never folded: each of them can have changed something.
+    pub(super) fn record_request(&mut self, now: Now, report: Report) {
+        self.push(now, report.about, Name::Word(report.name), |event| {
+            if report.is_command {
+                event.kind = EventKind::Command;
+            }
+            report.fill(event);
         });
     }
 
-    /// Journals the counts of storms whose window has ended.
+    /// Somebody asked for something that was refused. Those that repeat are folded.
+    pub(super) fn record_refusal(&mut self, now: Now, report: Report) {
+        if let Some(report) = self.refusals.admit(now.instant, report) {
+            self.record_request(now, report);
+        }
+    }
+
+    /// Journals the counts of storms whose window has ended, and of refusals.
     pub(super) fn handle_timeout(&mut self, now: Now) {
+        for report in self.refusals.take_due(now.instant) {
+            self.record_request(now, report);
+        }
         if self.next_flush.is_none_or(|flush| flush > now.instant) {
             return;
         }
@@ -136,7 +169,7 @@ impl EventLog {
 
     /// When the next count is due.
     pub(super) fn poll_timeout(&self) -> Option<Instant> {
-        self.next_flush
+        [self.next_flush, self.refusals.poll_timeout()].into_iter().flatten().min()
     }
 
     /// Takes the events, oldest first.
@@ -220,7 +253,7 @@ mod tests {
 
     #[test]
     fn a_storm_of_one_kind_is_folded_into_its_count_and_others_still_pass() {
-        let mut log = EventLog::new(Arc::default());
+        let mut log = EventLog::new(Arc::default(), 0);
         for millis in 0..30_000 {
             record(&mut log, millis, "storm");
         }
@@ -241,7 +274,7 @@ mod tests {
 
     #[test]
     fn after_a_quiet_window_events_are_journalled_one_by_one_again() {
-        let mut log = EventLog::new(Arc::default());
+        let mut log = EventLog::new(Arc::default(), 0);
         for millis in 0..30 {
             record(&mut log, millis, "storm");
         }
@@ -254,7 +287,7 @@ mod tests {
     }
     #[test]
     fn a_count_tells_how_the_last_of_them_was() {
-        let mut log = EventLog::new(Arc::default());
+        let mut log = EventLog::new(Arc::default(), 0);
         for step in 0..30_u64 {
             log.record(Now::from_millis(step), AlarmOwner::Gateway, Name::Word("storm"), |event| {
                 event.from = step.to_string();

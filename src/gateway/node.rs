@@ -4,9 +4,10 @@
 
 use std::time::Duration;
 
-use super::Gateway;
+use super::{Gateway, modules};
+use crate::canopen::boot::BootSettings;
 use crate::canopen::{ErrorControl, NmtState, PdoIndex};
-use crate::mapping::{AlarmOwner, BuiltIn, NodeDef};
+use crate::mapping::{AlarmOwner, BuiltIn, NodeDef, Protocol};
 use crate::process_image::{NodeIndex, NodeStatus, PdoStatus, Quality, Reason};
 use crate::time::{Instant, Now};
 
@@ -97,14 +98,16 @@ pub(super) enum Loss {
 
 impl Node {
     pub(super) fn new(def: &NodeDef, passive: bool) -> Self {
-        let pdos = &def.canopen.pdos;
+        let pdos = &def.pdos();
         let status = NodeStatus {
             passive,
             pdos: pdos.iter().map(|pdo| PdoStatus { number: pdo.number, ..PdoStatus::default() }).collect(),
             ..NodeStatus::default()
         };
         let asked = |place: usize| {
-            !passive && def.canopen.sdo.is_some() && def.canopen.boot.asks_about(PdoIndex(place))
+            !passive
+                && def.protocol.has_sdo()
+                && def.protocol.boot().is_some_and(|boot| boot.asks_about(PdoIndex(place)))
         };
         Self {
             status,
@@ -127,7 +130,7 @@ impl Node {
             missing_since: None,
             recovered_at: None,
             fell_silent: false,
-            asked_about_errors: !passive && def.canopen.boot.asks_about_errors(),
+            asked_about_errors: !passive && def.protocol.boot().is_some_and(BootSettings::asks_about_errors),
             last_emergency: None,
             watches: pdos
                 .iter()
@@ -184,7 +187,10 @@ impl Node {
     /// Whether frames are to be expected of it all the time.
     pub(super) fn is_expected(&self, def: &NodeDef) -> bool {
         let sends_pdos = self.watches.iter().any(|pdo| pdo.timeout.is_some());
-        if self.may_be_absent(def) {
+        // Another module is looked at once a minute only.
+        let is_other =
+            def.canopen().is_none() && matches!(self.boot_trouble, Some(BootTrouble::OtherDevice(_)));
+        if self.may_be_absent(def) || is_other {
             return false;
         }
         let may_send = matches!(self.nmt, None | Some(NmtState::Operational));
@@ -207,10 +213,10 @@ impl Node {
 
     /// Why it is not online, or not as it should be; empty when all is well.
     pub(super) fn reason(&self, def: &NodeDef, bus_trouble: Option<&str>) -> String {
-        let id = def.canopen.id;
         if let Some(trouble) = bus_trouble {
             return trouble.to_owned();
         }
+        let Some(id) = def.canopen().map(|settings| settings.id) else { return modules::reason(self, def) };
         if self.never_seen || (self.lost.is_some() && !self.ever_seen) {
             return format!(
                 "no frame from node {id} since the gateway started; possible causes: power or cable, the device is \
@@ -229,10 +235,10 @@ impl Node {
                 );
             }
             Some(Loss::Silence) => {
-                let silent = match def.canopen.error_control {
-                    ErrorControl::Guarding(_) => "does not answer guarding",
-                    ErrorControl::Heartbeat { .. } => "sends no heartbeat",
-                    ErrorControl::None => "is silent",
+                let silent = match def.canopen().map(|settings| &settings.error_control) {
+                    Some(ErrorControl::Guarding(_)) => "does not answer guarding",
+                    Some(ErrorControl::Heartbeat { .. }) => "sends no heartbeat",
+                    Some(ErrorControl::None) | None => "is silent",
                 };
                 return format!("node {id} {silent}; check its power and cable");
             }
@@ -281,9 +287,13 @@ impl Node {
     }
 }
 
-/// Whether guarding or heartbeat is configured (R-DET-031: a guard time of zero is no guarding).
+/// Whether guarding or heartbeat is configured (R-DET-031: a guard time of zero is no guarding), or a module is managed.
 fn is_watched(def: &NodeDef) -> bool {
-    match &def.canopen.error_control {
+    let settings = match &def.protocol {
+        Protocol::Canopen(settings) => settings,
+        Protocol::Esd(module) => return module.management.is_some(),
+    };
+    match &settings.error_control {
         ErrorControl::Guarding(guarding) => !guarding.guard_time.is_zero(),
         ErrorControl::Heartbeat { .. } => true,
         ErrorControl::None => false,
@@ -295,7 +305,8 @@ impl Gateway {
     pub(super) fn refresh_node(&mut self, now: Now, index: NodeIndex) {
         let Some(def) = self.table.nodes.get(index.0) else { return };
         let bus_trouble = self.bus_trouble(def.bus);
-        let undecided_until = self.undecided_until(now, &def.canopen, def.bus);
+        let undecided_until = self.undecided_until(now, def);
+        let is_module = def.canopen().is_none();
         let Some(node) = self.nodes.get_mut(index.0) else { return };
         let status = &mut node.status;
         status.online = node.contact && node.lost.is_none() && !node.fell_silent && bus_trouble.is_none();
@@ -315,7 +326,9 @@ impl Gateway {
         self.raise(now, owner, BuiltIn::NodeLost, lost, undecided_until);
         self.raise(now, owner, BuiltIn::NodeNeverSeen, never_seen, undecided_until);
         self.conditions.set(now, owner, BuiltIn::IdentityMismatch, other_device);
-        self.conditions.set(now, owner, BuiltIn::NotOperational, start_failed);
+        self.conditions.set(now, owner, BuiltIn::NotOperational, start_failed && !is_module);
+        // A module is not started; all that can go wrong is how it is set.
+        self.conditions.set(now, owner, BuiltIn::NotConfigured, boot_failed && is_module && !other_device);
         self.conditions.set(now, owner, BuiltIn::DuplicateNode, duplicate);
         self.conditions.set(now, owner, BuiltIn::ForeignGuardMaster, foreign_guard);
         let pdos = self.nodes.get(index.0).map_or(0, |node| node.watches.len());
@@ -349,7 +362,7 @@ impl Gateway {
         }
         self.next_expiry = None;
         for index in (0..self.nodes.len()).map(NodeIndex) {
-            let pdos = self.table.nodes.get(index.0).map_or(0, |def| def.canopen.pdos.len());
+            let pdos = self.table.nodes.get(index.0).map_or(0, |def| def.pdos().len());
             for pdo in (0..pdos).map(PdoIndex) {
                 self.expire_pdo(now, index, pdo);
             }

@@ -5,10 +5,11 @@ use std::time::Duration;
 use super::Gateway;
 use super::events::Name;
 use super::node::{Loss, Node};
+use super::tags::CarrierIndex;
 use crate::can::{CanFrame, CanId};
 use crate::canopen::object::ObjectId;
 use crate::canopen::{ErrorControl, NmtRequest, NmtState, NodeEvent, PdoIndex};
-use crate::mapping::{AlarmOwner, BuiltIn};
+use crate::mapping::{AlarmOwner, BuiltIn, NodeDef};
 use crate::process_image::{Event, NodeCounters, NodeIndex, Quality, Reason, Value};
 use crate::time::Now;
 
@@ -88,7 +89,7 @@ impl Gateway {
         self.refresh_node(now, index);
     }
 
-    fn frame_seen(&mut self, (now, index): (Now, NodeIndex)) {
+    pub(super) fn frame_seen(&mut self, (now, index): (Now, NodeIndex)) {
         let Some(node) = self.nodes.get_mut(index.0) else { return };
         let counters = &mut node.status.counters;
         counters.frames_received = counters.frames_received.saturating_add(1);
@@ -192,7 +193,7 @@ impl Gateway {
         let (now, index) = at;
         let Some(def) = self.table.nodes.get(index.0) else { return };
         // Decided once: what the node or its bus do later must not put off the alarm again and again.
-        let undecided_until = self.undecided_until(now, &def.canopen, def.bus);
+        let undecided_until = self.undecided_until(now, def);
         self.change(index, |node| {
             let held_until = undecided_until.max(node.suspect_until);
             if let (Some(status), Some(watch)) =
@@ -209,6 +210,7 @@ impl Gateway {
     }
 
     fn pdo_outside_window(&mut self, at: (Now, NodeIndex), pdo: PdoIndex, after: Duration) {
+        self.count(at.1, |counters| &mut counters.late_pdos);
         let number = self.pdo_number(at.1, pdo);
         self.tell(at, "pdo_outside_window", |event| {
             event.text = format!("TPDO{number} came {} us after SYNC", after.as_micros());
@@ -232,13 +234,13 @@ impl Gateway {
         self.tell(at, "malformed_frame", |event| event.text = format!("{frame} was not decoded"));
     }
 
-    fn seen(&mut self, at: (Now, NodeIndex)) {
+    pub(super) fn seen(&mut self, at: (Now, NodeIndex)) {
         self.change(at.1, |node| node.never_seen = false);
         self.make_contact(at.1);
         self.tell(at, "node_seen", |_| ());
     }
 
-    fn never_seen(&mut self, at: (Now, NodeIndex)) {
+    pub(super) fn never_seen(&mut self, at: (Now, NodeIndex)) {
         self.change(at.1, |node| {
             node.begin_missing(at.0);
             node.never_seen = true;
@@ -262,11 +264,12 @@ impl Gateway {
             }
         });
         if to == NmtState::Initialising {
+            // Whoever ordered it: what is read is as old as what is sent, until the boot is done.
+            self.degrade(now, index, None, Quality::Stale(Reason::NodeRestarted));
             self.show_errors_unasked(now, index);
-        }
-        if !operational {
+        } else if !operational {
             // Objects are read in other states too.
-            let pdos = self.table.nodes.get(index.0).map_or(0, |def| def.canopen.pdos.len());
+            let pdos = self.table.nodes.get(index.0).map_or(0, |def| def.pdos().len());
             for pdo in (0..pdos).map(PdoIndex) {
                 self.degrade(now, index, Some(pdo), Quality::Stale(Reason::NodeNotOperational));
             }
@@ -281,7 +284,7 @@ impl Gateway {
         });
     }
 
-    fn restarted(&mut self, at: (Now, NodeIndex)) {
+    pub(super) fn restarted(&mut self, at: (Now, NodeIndex)) {
         let (now, index) = at;
         self.change(index, |node| node.watches.iter_mut().for_each(|watch| watch.told_too_long = false));
         self.count(index, |counters| &mut counters.restarts);
@@ -324,7 +327,8 @@ impl Gateway {
     fn toggle_error(&mut self, at: (Now, NodeIndex), consecutive: u16) {
         let (now, index) = at;
         self.count(index, |counters| &mut counters.toggle_errors);
-        let guard_time = match self.table.nodes.get(index.0).map(|def| &def.canopen.error_control) {
+        let settings = self.table.nodes.get(index.0).and_then(NodeDef::canopen);
+        let guard_time = match settings.map(|settings| &settings.error_control) {
             Some(ErrorControl::Guarding(guarding)) => guarding.guard_time,
             Some(ErrorControl::Heartbeat { .. } | ErrorControl::None) | None => return,
         };
@@ -343,15 +347,17 @@ impl Gateway {
 
     /// A node that misses its first reply will have answered, or be lost, within its life time.
     fn suspect(&mut self, now: Now, index: NodeIndex, consecutive: u16) {
-        let Some(def) = self.table.nodes.get(index.0) else { return };
-        let ErrorControl::Guarding(guarding) = &def.canopen.error_control else { return };
+        let settings = self.table.nodes.get(index.0).and_then(NodeDef::canopen);
+        let Some(ErrorControl::Guarding(guarding)) = settings.map(|settings| &settings.error_control) else {
+            return;
+        };
         let life_time = guarding.guard_time * u32::from(guarding.life_time_factor) + guarding.reply_timeout;
         if consecutive == 1 {
             self.change(index, |node| node.suspect_until = Some(now.instant + life_time));
         }
     }
 
-    fn lost(&mut self, at: (Now, NodeIndex), stuck_toggle: bool) {
+    pub(super) fn lost(&mut self, at: (Now, NodeIndex), stuck_toggle: bool) {
         let (now, index) = at;
         let loss = if stuck_toggle { Loss::StuckToggle } else { Loss::Silence };
         let mut was_there = false;
@@ -372,9 +378,10 @@ impl Gateway {
         }
     }
 
-    fn recovered(&mut self, at: (Now, NodeIndex)) {
+    pub(super) fn recovered(&mut self, at: (Now, NodeIndex)) {
         let mut told_lost = false;
         self.change(at.1, |node| {
+            node.never_seen = false;
             node.lost = None;
             node.recovered_at = Some(at.0.instant);
             node.suspect_until = None;
@@ -390,8 +397,13 @@ impl Gateway {
     fn duplicate_suspected(&mut self, at: (Now, NodeIndex), evidence: &'static str) {
         let mut first = false;
         self.change(at.1, |node| first = node.duplicate.replace(evidence).is_none());
-        if first {
-            self.degrade(at.0, at.1, None, Quality::Uncertain(Reason::DuplicateNode));
+        if let Some(def) = self.table.nodes.get(at.1.0).filter(|_| first) {
+            // What the node is sent reaches it, whoever else hears it.
+            let [_, last] = CarrierIndex::of_emergencies(def);
+            for carrier in (0..=last.0).map(CarrierIndex) {
+                let quality = Quality::Uncertain(Reason::DuplicateNode);
+                self.tags.degrade(&self.table, at.0, at.1, Some(carrier), quality);
+            }
         }
         self.tell(at, "duplicate_node", |event| evidence.clone_into(&mut event.text));
     }
@@ -468,7 +480,7 @@ impl Gateway {
 
     /// The number of a TPDO as users know it.
     pub(super) fn pdo_number(&self, index: NodeIndex, pdo: PdoIndex) -> u16 {
-        let settings = self.table.nodes.get(index.0).and_then(|def| def.canopen.pdos.get(pdo.0));
+        let settings = self.table.nodes.get(index.0).and_then(|def| def.pdos().get(pdo.0));
         settings.map_or(0, |pdo| pdo.number)
     }
 }

@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 
 use super::core::{Gateway, Output};
-use super::events::Name;
+use super::kept::Kept;
+use super::operate::{no_canopen, outcome_word, told};
+use super::refusals::Report;
 use super::{CommandSource, Outcome};
 use crate::canopen::object::{DataType, ObjectId};
 use crate::canopen::sdo::{Refused, SdoAction, SdoError, SdoRequest, TransferId};
@@ -30,10 +32,40 @@ pub(super) struct Asked {
     pub(super) node: NodeIndex,
     /// In words: the object, and what is written.
     pub(super) what: String,
-    pub(super) writes: bool,
+    /// The word of the request in the journal.
+    pub(super) name: &'static str,
+    /// What is written.
+    written: Option<(ObjectId, Vec<u8>)>,
+}
+
+impl Transfers {
+    /// Takes over what is under way with nodes that stay; the others were broken off before. No number is given out twice.
+    pub(super) fn take_over(&mut self, old: Self, kept: &Kept) {
+        self.newest = old.newest;
+        for (id, asked) in old.open {
+            if let Some(node) = kept.new_node(asked.node) {
+                self.open.insert(id, Asked { node, ..asked });
+            }
+        }
+    }
 }
 
 impl Gateway {
+    /// Whoever waits for one of these nodes gets this answer; what comes of the transfer is nobody's then.
+    pub(super) fn break_off_transfers(
+        &mut self,
+        now: Now,
+        of: impl Fn(NodeIndex) -> bool,
+        outcome: &Outcome,
+    ) {
+        let open = std::mem::take(&mut self.transfers.open);
+        let (gone, stay): (BTreeMap<_, _>, _) = open.into_iter().partition(|(_, asked)| of(asked.node));
+        self.transfers.open = stay;
+        for asked in gone.into_values() {
+            self.conclude(now, asked, outcome.clone());
+        }
+    }
+
     /// Asks the node. Its answer, or why it is not even asked, becomes the answer to the request.
     pub(super) fn request_object(
         &mut self,
@@ -42,8 +74,34 @@ impl Gateway {
         node: NodeIndex,
         request: SdoRequest,
     ) {
-        let (what, writes) = in_words(&request);
-        let asked = Asked { id, source, node, what, writes };
+        let what = in_words(&request);
+        let name = if request.action == SdoAction::Read { "sdo_read" } else { "sdo_write" };
+        self.request_as(now, (id, source), (node, what, name), request);
+    }
+
+    /// Writes a tag that is an object of its node; `what` tells it for the journal.
+    pub(super) fn request_write(
+        &mut self,
+        now: Now,
+        asker: (u64, CommandSource),
+        (node, what): (NodeIndex, String),
+        request: SdoRequest,
+    ) {
+        self.request_as(now, asker, (node, what, "write"), request);
+    }
+
+    fn request_as(
+        &mut self,
+        now: Now,
+        (id, source): (u64, CommandSource),
+        (node, what, name): (NodeIndex, String, &'static str),
+        request: SdoRequest,
+    ) {
+        let written = match &request.action {
+            SdoAction::Read => None,
+            SdoAction::Write(data) => Some((request.object, data.clone())),
+        };
+        let asked = Asked { id, source, node, what, name, written };
         if let Err(outcome) = self.begin_transfer(now, asked.clone(), request) {
             self.conclude(now, asked, outcome);
         }
@@ -59,7 +117,8 @@ impl Gateway {
                 "the gateway is passive on bus `{name}`: it sends nothing there"
             )));
         }
-        let (node_id, index) = (def.canopen.id, def.bus);
+        let canopen = def.canopen().ok_or_else(no_canopen)?;
+        let (node_id, index) = (canopen.id, def.bus);
         let bus = self.buses.get_mut(index.0).ok_or(Outcome::Unknown)?;
         if !bus.is_up() {
             return Err(Outcome::NodeUnavailable);
@@ -72,11 +131,11 @@ impl Gateway {
         Ok(())
     }
 
-    /// A transfer that was asked for is over.
+    /// A transfer that was asked for is over. A unit that was written is the device's from now on (R-DST-034).
     pub(super) fn transfer_done(&mut self, now: Now, id: TransferId, result: &Result<Vec<u8>, SdoError>) {
         let Some(asked) = self.transfers.open.remove(&id) else { return };
         let outcome = match result {
-            Ok(_) if asked.writes => Outcome::Done,
+            Ok(_) if asked.written.is_some() => Outcome::Done,
             Ok(data) => Outcome::Read(data.clone()),
             Err(SdoError::Abort(code)) => Outcome::Aborted(*code),
             Err(SdoError::Timeout { .. } | SdoError::TooSlow { .. }) => Outcome::Timeout,
@@ -85,35 +144,45 @@ impl Gateway {
                 Outcome::Failed(error.to_string())
             }
         };
+        if let (Outcome::Done, Some((object, data))) = (&outcome, &asked.written) {
+            self.learn((now, asked.node), *object, Some(data));
+        }
         self.conclude(now, asked, outcome);
     }
 
-    /// Answers a request. A write is journalled, whatever came of it; a read only if it failed, and many alike as one.
+    /// Answers a request. A write is journalled, whatever came of it, and what a grant allowed; any other read only if it failed. Refusals that repeat are told as one.
     fn conclude(&mut self, now: Now, asked: Asked, outcome: Outcome) {
-        if asked.writes {
+        if asked.written.is_some() {
+            return self.finish_write(now, asked, outcome);
+        }
+        if asked.source.access.is_some() {
             return self.finish_write(now, asked, outcome);
         }
         if !matches!(outcome, Outcome::Read(_) | Outcome::Busy) {
-            let owner = self.owner_of_node(asked.node);
-            self.events.record(now, owner, Name::Word("sdo_read_failed"), |event| {
-                event.from = super::operate::source_text(&asked.source);
-                super::operate::outcome_word(&outcome).clone_into(&mut event.to);
-                event.text = super::operate::told(&outcome, asked.what);
-            });
+            let report = Report {
+                source: asked.source,
+                name: "sdo_read_failed",
+                is_command: false,
+                about: self.owner_of_node(asked.node),
+                outcome: outcome_word(&outcome),
+                text: told(&outcome, asked.what),
+                count: 1,
+            };
+            self.events.record_refusal(now, report);
         }
         self.outputs.push_back(Output::Reply { id: asked.id, outcome });
     }
 }
 
-fn in_words(request: &SdoRequest) -> (String, bool) {
+fn in_words(request: &SdoRequest) -> String {
     match &request.action {
-        SdoAction::Read => (request.object.to_string(), false),
-        SdoAction::Write(data) => (written(request.object, data), true),
+        SdoAction::Read => request.object.to_string(),
+        SdoAction::Write(data) => written(request.object, data),
     }
 }
 
 /// `0x6132:1 = 02`; of long values the beginning and the number of bytes.
-fn written(object: ObjectId, data: &[u8]) -> String {
+pub(super) fn written(object: ObjectId, data: &[u8]) -> String {
     let shown = data.get(..SHOWN).unwrap_or(data);
     let hex = DataType::OctetString.decode(shown).unwrap_or_default();
     if shown.len() == data.len() {

@@ -3,13 +3,20 @@
 //! The network decides when an RPDO is sent, and whether its node takes part; here is what it carries. A tag of an RPDO shows
 //! what was sent last, not what was written: as soon as the device may not have it, its quality says so.
 
+mod carry;
+
+use std::collections::BTreeMap;
+
 use super::command::Outcome;
 use super::core::{Gateway, Output};
+use super::operate::Carrying;
 use super::tags::CarrierIndex;
-use crate::can::{BusIndex, CanFrame};
+use crate::can::BusIndex;
+use crate::canopen::RpdoIndex;
 use crate::canopen::boot::MappedPdo;
-use crate::canopen::{Role, RpdoIndex};
-use crate::mapping::{Field, Scale, Source, TagTable, WriteLimits, codec};
+use crate::canopen::object::ObjectId;
+use crate::canopen::sdo::SdoRequest;
+use crate::mapping::{Field, ReadOnly, Scale, Source, TagTable, WriteLimits, Writing, codec};
 use crate::process_image::{NodeIndex, Quality, Reason, TagIndex, Value};
 use crate::time::Now;
 
@@ -107,6 +114,16 @@ impl Slot {
     }
 }
 
+/// A tag that is never written is no fault of the moment.
+fn read_only(why: &ReadOnly) -> Outcome {
+    match why {
+        ReadOnly::Unknown => Outcome::Unknown,
+        ReadOnly::Passive | ReadOnly::Outputs(_) | ReadOnly::Sdo(_) | ReadOnly::Device => {
+            Outcome::Rejected(why.to_string())
+        }
+    }
+}
+
 impl Gateway {
     /// Hands all defaults to the networks.
     pub(super) fn begin_supply(&mut self, now: Now) {
@@ -125,46 +142,120 @@ impl Gateway {
     fn supply_rpdo(&mut self, now: Now, node: NodeIndex, rpdo: RpdoIndex) {
         let Some(def) = self.table.nodes.get(node.0) else { return };
         let data = self.supply.data(node, rpdo);
-        if let Some(bus) = self.buses.get_mut(def.bus.0) {
-            bus.network.set_rpdo(now, def.canopen.id, rpdo, data);
+        if let Some(bus) = self.buses.get_mut(def.bus.0)
+            && let Some(canopen) = def.canopen()
+        {
+            bus.network.set_rpdo(now, canopen.id, rpdo, data);
         }
     }
 
-    /// Writes a value, if that is allowed. `frame` becomes the one that carries it, where one is sent at once.
-    pub(super) fn write_tag(
+    /// Checks all of these writes, then does them: those of RPDOs at once; the one of an object is given back as what is to be
+    /// asked of which node. `frames` gets those that carry them, where they are sent at once.
+    ///
+    /// # Errors
+    /// What becomes of the request; nothing was written then.
+    pub(super) fn write_tags(
         &mut self,
         now: Now,
+        writes: &[(TagIndex, Value)],
+        frames: &mut Vec<Carrying>,
+    ) -> Result<Option<(NodeIndex, SdoRequest)>, Outcome> {
+        let mut places = Vec::with_capacity(writes.len());
+        for (tag, value) in writes {
+            let name = self.table.tag(*tag).map(|def| def.name.clone()).unwrap_or_default();
+            let with_name = |outcome: Outcome| {
+                if let (Outcome::Rejected(why), true) = (&outcome, writes.len() > 1) {
+                    return Outcome::Rejected(format!("`{name}`: {why}"));
+                }
+                outcome
+            };
+            let writing = self.table.writing(*tag).map_err(|why| read_only(&why)).map_err(with_name)?;
+            if let Writing::Object(object, limits) = writing {
+                return match writes {
+                    [_] => self.object_write(*tag, *value, (object, limits)).map(Some),
+                    _ => Err(Outcome::Rejected(format!("`{name}` is an object: it is written by itself"))),
+                };
+            }
+            if writes.iter().filter(|(other, _)| other == tag).count() > 1 {
+                return Err(with_name(Outcome::Rejected("it is written twice".to_owned())));
+            }
+            places.push(self.check_write(*tag, *value).map_err(with_name)?);
+        }
+        if places.is_empty() {
+            return Err(Outcome::Rejected("there is nothing to write".to_owned()));
+        }
+        let mut undo: BTreeMap<(NodeIndex, RpdoIndex, BusIndex), Vec<Undo>> = BTreeMap::new();
+        for ((node, rpdo, bus), (tag, value)) in places.into_iter().zip(writes) {
+            let Some(slot) = self.slot(node, rpdo, *tag) else { continue };
+            let before = slot.value.replace(*value);
+            undo.entry((node, rpdo, bus)).or_default().push(Undo { node, rpdo, tag: *tag, before });
+        }
+        for ((node, rpdo, bus), undo) in undo {
+            frames.extend(self.send_written((node, rpdo, bus), now, undo));
+        }
+        Ok(None)
+    }
+
+    fn slot(&mut self, node: NodeIndex, rpdo: RpdoIndex, tag: TagIndex) -> Option<&mut Slot> {
+        self.supply.rpdo(node, rpdo)?.slots.iter_mut().find(|slot| slot.tag == tag)
+    }
+
+    /// Where a tag of an RPDO is written, if this value can be written there now.
+    fn check_write(
+        &mut self,
         tag: TagIndex,
         value: Value,
-        frame: &mut Option<(BusIndex, CanFrame)>,
-    ) -> (Outcome, Option<Undo>) {
-        let Some((node, rpdo, bus)) = self.written_in(tag) else {
-            let known = self.table.tag(tag).is_some();
-            let read_only = "the tag cannot be written: its value comes from the device".to_owned();
-            return (if known { Outcome::Rejected(read_only) } else { Outcome::Unknown }, None);
-        };
-        if let Err(outcome) = self.may_write(node, rpdo, bus) {
-            return (outcome, None);
-        }
-        let slot = self.supply.rpdo(node, rpdo).and_then(|rpdo| {
-            let mut slots = rpdo.slots.iter_mut();
-            slots.find(|slot| slot.tag == tag)
-        });
-        let Some(slot) = slot else { return (Outcome::Unknown, None) };
-        if let Some(why) = slot.refusal(value) {
-            return (Outcome::Rejected(why), None);
-        }
-        let before = slot.value.replace(value);
+    ) -> Result<(NodeIndex, RpdoIndex, BusIndex), Outcome> {
+        let (node, rpdo, bus) = self.written_in(tag).ok_or(Outcome::Unknown)?;
+        self.may_write(node, rpdo)?;
+        let slot = self.slot(node, rpdo, tag).ok_or(Outcome::Unknown)?;
+        slot.refusal(value).map_or(Ok((node, rpdo, bus)), |why| Err(Outcome::Rejected(why)))
+    }
+
+    /// Hands an RPDO to its network; gives the frame, where one is sent at once.
+    fn send_written(
+        &mut self,
+        (node, rpdo, bus): (NodeIndex, RpdoIndex, BusIndex),
+        now: Now,
+        undo: Vec<Undo>,
+    ) -> Option<Carrying> {
         let sent_before = self.outputs.len();
         self.supply_rpdo(now, node, rpdo);
         self.drain_network(now, bus);
-        let settings = self.table.nodes.get(node.0).and_then(|def| def.canopen.rpdos.get(rpdo.0));
+        let settings = self.table.nodes.get(node.0).and_then(|def| def.protocol.rpdos().get(rpdo.0));
         let cob_id = settings.map(|settings| settings.cob_id);
-        *frame = self.outputs.iter().skip(sent_before).find_map(|output| match output {
-            Output::Transmit { bus, frame } if Some(frame.id()) == cob_id => Some((*bus, *frame)),
+        let frame = self.outputs.iter().skip(sent_before).find_map(|output| match output {
+            Output::Transmit { frame, .. } if Some(frame.id()) == cob_id => Some(*frame),
             Output::Transmit { .. } | Output::Reply { .. } => None,
-        });
-        (Outcome::Done, Some(Undo { node, rpdo, tag, before }))
+        })?;
+        Some(Carrying { bus, frame, undo })
+    }
+
+    /// What is to be asked of a node so that an object gets a value, if that can be asked now.
+    fn object_write(
+        &self,
+        tag: TagIndex,
+        value: Value,
+        (object, limits): (ObjectId, WriteLimits),
+    ) -> Result<(NodeIndex, SdoRequest), Outcome> {
+        let def = self.table.tag(tag).ok_or(Outcome::Unknown)?;
+        let (Source::Pdo { field, scale, .. }
+        | Source::Polled { field, scale, .. }
+        | Source::Adopted { field, scale, .. }) = def.source
+        else {
+            return Err(read_only(&ReadOnly::Device));
+        };
+        // By SDO it stands alone, wherever a TPDO may carry it.
+        let slot = Slot { tag, field: Field { bit: 0, ..field }, scale, limits, value: None };
+        if let Some(why) = slot.refusal(value) {
+            return Err(Outcome::Rejected(why));
+        }
+        let mut data = [0; 8];
+        let encoded = codec::encode(&slot.field, &scale, value, &mut data);
+        encoded.map_err(|error| Outcome::Rejected(error.to_string()))?;
+        let bytes = usize::from(field.width.div_ceil(8));
+        let data = data.get(..bytes).unwrap_or_default().to_vec();
+        Ok((def.node, SdoRequest::write(object, data)))
     }
 
     fn written_in(&self, tag: TagIndex) -> Option<(NodeIndex, RpdoIndex, BusIndex)> {
@@ -173,18 +264,8 @@ impl Gateway {
         Some((def.node, RpdoIndex(rpdo), self.table.node(def.node)?.bus))
     }
 
-    fn may_write(&mut self, node: NodeIndex, rpdo: RpdoIndex, bus: BusIndex) -> Result<(), Outcome> {
+    fn may_write(&mut self, node: NodeIndex, rpdo: RpdoIndex) -> Result<(), Outcome> {
         let Some(def) = self.table.node(node) else { return Err(Outcome::Unknown) };
-        let passive = self.table.buses.get(bus.0).is_none_or(|bus| bus.role == Role::Passive);
-        if passive {
-            return Err(Outcome::Rejected(
-                "the gateway is passive on this bus: it sends nothing there".into(),
-            ));
-        }
-        if !def.outputs {
-            let message = format!("outputs are not enabled for `{0}`: [node.{0}] outputs = true", def.name);
-            return Err(Outcome::Rejected(message));
-        }
         let number = def.rpdos.get(rpdo.0).map_or(0, |rpdo| rpdo.number);
         let running = self.supply.nodes.get(node.0).is_some_and(|node| node.running);
         if !running {
@@ -253,9 +334,12 @@ impl Gateway {
     pub(super) fn rpdo_mapped(&mut self, at: (Now, NodeIndex), mapped: &MappedPdo) {
         let rpdo = RpdoIndex(mapped.pdo.0);
         let Some(def) = self.table.nodes.get(at.1.0) else { return };
-        let Some(settings) = def.canopen.rpdos.get(rpdo.0) else { return };
-        let maps_differ =
-            def.canopen.boot.setup_of_rpdo(rpdo).is_some_and(|wanted| wanted.maps != mapped.maps);
+        let Some(settings) = def.protocol.rpdos().get(rpdo.0) else { return };
+        let maps_differ = def
+            .protocol
+            .boot()
+            .and_then(|boot| boot.setup_of_rpdo(rpdo))
+            .is_some_and(|wanted| wanted.maps != mapped.maps);
         let differs = maps_differ || mapped.cob_id != Some(settings.cob_id);
         let (number, wanted) = (settings.number, settings.cob_id);
         if let Some(rpdo) = self.supply.rpdo(at.1, rpdo) {

@@ -9,7 +9,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::canopen::{PdoIndex, RpdoIndex};
-use crate::mapping::{Derived, EmergencyPart, Field, FieldKind, NodeDef, Scale, Source, TagTable, codec};
+use crate::mapping::{
+    Derived, EmergencyPart, Field, FieldKind, ModuleCarrier, NodeDef, Scale, Source, TagTable, codec,
+};
 use crate::process_image::{NodeIndex, ProcessImage, Quality, Reason, Revision, Sample, TagIndex, Value};
 use crate::time::{Instant, Now};
 
@@ -18,6 +20,9 @@ use super::marks::Marks;
 use super::units::Units;
 
 mod adopted;
+mod carry;
+#[cfg(test)]
+mod module_tests;
 use adopted::Adopted;
 
 /// All tags.
@@ -37,7 +42,7 @@ struct Layout {
 }
 
 /// Which carrier of a node: its TPDOs, by their places in its settings; then the objects that are polled, by theirs; then
-/// those of its errors; then the RPDOs of its definition.
+/// those of its errors; then the values of an esd module and its lines; then the RPDOs of its definition.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct CarrierIndex(pub(super) usize);
 
@@ -45,7 +50,13 @@ impl CarrierIndex {
     /// That of an RPDO.
     pub(super) fn of_rpdo(node: &NodeDef, rpdo: RpdoIndex) -> Self {
         let [_, last] = Self::of_emergencies(node);
-        Self(last.0 + 1 + rpdo.0)
+        Self(last.0 + 1 + node.protocol.module().map_or(0, ModuleCarrier::count) + rpdo.0)
+    }
+
+    /// That of a value of an esd module: 8 bytes, the lowest first. `None` for any other node.
+    pub(super) fn of_module(node: &NodeDef, value: ModuleCarrier) -> Option<Self> {
+        let [_, last] = Self::of_emergencies(node);
+        Some(Self(last.0 + 1 + value.place(node.protocol.module()?.channels.len())))
     }
 }
 
@@ -58,7 +69,7 @@ impl From<PdoIndex> for CarrierIndex {
 impl CarrierIndex {
     /// What emergency messages told last, as the 8 bytes of one; and how many errors there are, in one byte.
     pub(super) fn of_emergencies(node: &NodeDef) -> [Self; 2] {
-        let first = node.canopen.pdos.len() + node.canopen.polls.len();
+        let first = node.pdos().len() + node.protocol.polls().len();
         [Self(first), Self(first + 1)]
     }
 }
@@ -67,7 +78,7 @@ impl CarrierIndex {
 struct NodeLayout {
     /// By [`CarrierIndex`].
     carriers: Vec<CarrierLayout>,
-    /// How many of them come from the node.
+    /// How many of them, from the first on, come from the node. What a module is not asked for does not count.
     received: usize,
     /// In the order of the table: inputs come before what is computed from them.
     derived: Vec<TagIndex>,
@@ -316,10 +327,12 @@ impl Layout {
 impl NodeLayout {
     fn new(table: &TagTable, node: &NodeDef, dependents: &[Vec<TagIndex>], units: &Units) -> Self {
         let mut carriers = Vec::new();
-        let pdos = node.canopen.pdos.len();
+        let pdos = node.pdos().len();
         let [told, count] = CarrierIndex::of_emergencies(node);
-        let received = count.0 + 1;
-        carriers.resize_with(received + node.rpdos.len(), CarrierLayout::default);
+        let first_value = count.0 + 1;
+        let module = node.protocol.module();
+        let first_sent = first_value + module.map_or(0, ModuleCarrier::count);
+        carriers.resize_with(first_sent + node.rpdos.len(), CarrierLayout::default);
         let (mut derived, mut adopted) = (Vec::new(), Vec::new());
         for tag in node.tags.clone().map(TagIndex) {
             let placed = match table.tag(tag).map(|tag| &tag.source) {
@@ -332,7 +345,11 @@ impl NodeLayout {
                     adopted.push(Adopted { object: *object, poll, placed });
                     None
                 }
-                Some(Source::Rpdo { rpdo, field, scale, .. }) => Some((received + rpdo, field, scale)),
+                Some(Source::Rpdo { rpdo, field, scale, .. }) => Some((first_sent + rpdo, field, scale)),
+                Some(Source::Module { carrier, field, scale }) => module
+                    .and_then(|module| ModuleCarrier::at(*carrier, module.channels.len()))
+                    .and_then(|value| CarrierIndex::of_module(node, value))
+                    .map(|carrier| (carrier.0, field, scale)),
                 Some(Source::Emergency { part, field, scale }) => {
                     let carrier = if *part == EmergencyPart::ActiveCount { count } else { told };
                     Some((carrier.0, field, scale))
@@ -350,6 +367,7 @@ impl NodeLayout {
                 }
             }
         }
+        let received = first_value + module.map_or(0, ModuleCarrier::told);
         let mut layout = Self { carriers, received, derived, adopted };
         layout.place_polled(dependents);
         layout
@@ -486,7 +504,8 @@ fn never_received(source: &Source) -> Sample {
         | Source::Polled { field, scale, .. }
         | Source::Adopted { field, scale, .. }
         | Source::Rpdo { field, scale, .. }
-        | Source::Emergency { field, scale, .. } => {
+        | Source::Emergency { field, scale, .. }
+        | Source::Module { field, scale, .. } => {
             let raw = match field.kind {
                 FieldKind::Bool => Value::Bool(false),
                 FieldKind::Unsigned => Value::Unsigned(0),

@@ -2,6 +2,8 @@
 //!
 //! What a device said is forgotten when it is asked anew; until it has answered, no value is made of its numbers (R-DST-034).
 
+mod carry;
+
 use std::collections::BTreeMap;
 
 use crate::canopen::Role;
@@ -77,7 +79,7 @@ impl Units {
                 | Source::Polled { scale, .. }
                 | Source::Adopted { scale, .. }
                 | Source::Rpdo { scale, .. } => *scale,
-                Source::Derived(_) | Source::Emergency { .. } => return None,
+                Source::Derived(_) | Source::Emergency { .. } | Source::Module { .. } => return None,
             };
             let def = tag.device_unit.clone()?;
             let node = table.node(tag.node)?;
@@ -93,7 +95,7 @@ impl Units {
                 before: None,
                 def,
             };
-            if !master || node.canopen.sdo.is_none() {
+            if !master || !node.protocol.has_sdo() {
                 let assumed = |told: Option<&Told>| Answer::Given(told.and_then(|told| told.assumed));
                 entry.unit = assumed(entry.def.unit.as_ref());
                 entry.digits = assumed(entry.def.digits.as_ref());
@@ -131,13 +133,15 @@ impl Units {
         for entry in self.list.iter_mut().filter(|entry| entry.node == node) {
             let is = |told: &Option<Told>| told.is_some_and(|told| told.object == object);
             let (unit, digits) = (is(&entry.def.unit), is(&entry.def.digits));
+            let before = (entry.unit, entry.digits);
             if unit {
                 entry.unit = Answer::Given(number);
             }
             if digits {
                 entry.digits = Answer::Given(number);
             }
-            if unit || digits {
+            // It is asked again and again, and says the same as a rule.
+            if before != (entry.unit, entry.digits) {
                 self.changed = true;
                 findings.extend(entry.resolve().into_iter().map(|what| Finding { tag: entry.tag, what }));
             }

@@ -57,7 +57,18 @@ const BUS_TROUBLE_OR_OTHER: &[&str] = &["bus_off", "interface_down", "bus_silent
 const NO_START: &[&str] = &["bus_off", "interface_down", "bus_silent", "node_lost", "identity_mismatch"];
 
 /// Those of the gateway.
-pub const OF_GATEWAY: &[BuiltinAlarm] = &[BuiltinAlarm {
+pub const OF_GATEWAY: &[BuiltinAlarm] = &[
+    MQTT_DOWN,
+    ACCESS_REFUSED,
+    CONFIGURATION_REJECTED,
+    CERTIFICATE_EXPIRES,
+    CERTIFICATE_EXPIRES_SOON,
+    CERTIFICATE_EXPIRED,
+    BUFFER_FILLING,
+    BUFFER_FAULT,
+];
+
+const MQTT_DOWN: BuiltinAlarm = BuiltinAlarm {
     name: "mqtt_down",
     condition: BuiltIn::MqttDown,
     priority: Priority::Medium,
@@ -68,7 +79,98 @@ pub const OF_GATEWAY: &[BuiltinAlarm] = &[BuiltinAlarm {
     bit: None,
     text: "There is no session with the MQTT broker.",
     action: "Check the broker, the network between and the settings under [mqtt]; Modbus is not concerned.",
-}];
+};
+
+const CONFIGURATION_REJECTED: BuiltinAlarm = BuiltinAlarm {
+    name: "configuration_rejected",
+    condition: BuiltIn::ConfigurationRejected,
+    priority: Priority::Medium,
+    on_delay_ms: 0,
+    off_delay_ms: 0,
+    latch: false,
+    suppressed_by: &[],
+    bit: None,
+    text: "A changed configuration was refused; the gateway goes on with the one before.",
+    action: "Mend the file as the log and the event say, try it with `cangate check`, and load it again.",
+};
+
+const CERTIFICATE_EXPIRES: BuiltinAlarm = BuiltinAlarm {
+    name: "certificate_expires",
+    condition: BuiltIn::CertificateExpires,
+    priority: Priority::Low,
+    on_delay_ms: 0,
+    off_delay_ms: 0,
+    latch: false,
+    suppressed_by: &[],
+    bit: None,
+    text: "A certificate of TLS expires within a month.",
+    action: "See in /api/v1/status (`certificates`) which file it is in, and put a new one there; no restart is needed.",
+};
+
+const CERTIFICATE_EXPIRES_SOON: BuiltinAlarm = BuiltinAlarm {
+    name: "certificate_expires_soon",
+    condition: BuiltIn::CertificateExpiresSoon,
+    priority: Priority::High,
+    on_delay_ms: 0,
+    off_delay_ms: 0,
+    latch: false,
+    suppressed_by: &[],
+    bit: None,
+    text: "A certificate of TLS expires within a week.",
+    action: "See in /api/v1/status (`certificates`) which file it is in, and put a new one there; no restart is needed.",
+};
+
+const CERTIFICATE_EXPIRED: BuiltinAlarm = BuiltinAlarm {
+    name: "certificate_expired",
+    condition: BuiltIn::CertificateExpired,
+    priority: Priority::Critical,
+    on_delay_ms: 0,
+    off_delay_ms: 0,
+    latch: false,
+    suppressed_by: &[],
+    bit: None,
+    text: "A certificate of TLS has expired: others no longer accept connections with it.",
+    action: "See in /api/v1/status (`certificates`) which file it is in, and put a new one there; no restart is needed.",
+};
+
+const ACCESS_REFUSED: BuiltinAlarm = BuiltinAlarm {
+    name: "access_refused",
+    condition: BuiltIn::AccessRefused,
+    priority: Priority::Medium,
+    on_delay_ms: 0,
+    off_delay_ms: 300_000,
+    latch: false,
+    suppressed_by: &[],
+    bit: None,
+    text: "Somebody asks again and again for what is not allowed: five requests or more were refused within a minute.",
+    action: "The events of kind \"command\" with \"forbidden\" tell who. Find out whether it is a mistake of a client or of an [access] table, or somebody who should not be there.",
+};
+
+const BUFFER_FILLING: BuiltinAlarm = BuiltinAlarm {
+    name: "buffer_filling",
+    condition: BuiltIn::BufferFilling,
+    priority: Priority::Medium,
+    on_delay_ms: 0,
+    off_delay_ms: 10_000,
+    latch: false,
+    suppressed_by: &[],
+    bit: None,
+    text: "What is kept for the MQTT broker fills 80 % of its room; when it is full the oldest leaves.",
+    action: "Bring the broker back, or give the buffer more room (buffer_bytes); bridge/health tells how many hours are left.",
+};
+
+const BUFFER_FAULT: BuiltinAlarm = BuiltinAlarm {
+    name: "buffer_fault",
+    condition: BuiltIn::BufferFault,
+    priority: Priority::High,
+    on_delay_ms: 0,
+    off_delay_ms: 60_000,
+    latch: false,
+    suppressed_by: &[],
+    bit: None,
+    text: "The disk on which messages for the MQTT broker are kept cannot be used; memory holds them meanwhile.",
+    action: "See in the log what failed, then check room, permissions and health of the disk of buffer_dir.",
+};
 
 /// Those of each bus, a cause before what it suppresses.
 pub const OF_BUS: &[BuiltinAlarm] = &[
@@ -170,7 +272,8 @@ pub const OF_BUS: &[BuiltinAlarm] = &[
     },
 ];
 
-/// Those of each node, a cause before what it suppresses. `pdo_timeout_{}` is there once for each TPDO.
+/// Those of each node, a cause before what it suppresses. `pdo_timeout_{}` is there once for each TPDO. A CANopen device has all
+/// but the last; an esd module those that [`is_of_module`] tells.
 pub const OF_NODE: &[BuiltinAlarm] = &[
     BuiltinAlarm {
         name: "identity_mismatch",
@@ -304,4 +407,29 @@ pub const OF_NODE: &[BuiltinAlarm] = &[
         text: "The device reports an error that its mapping does not name.",
         action: "Look up the error code in the manual of the device.",
     },
+    BuiltinAlarm {
+        name: "module_not_configured",
+        condition: BuiltIn::NotConfigured,
+        priority: Priority::Medium,
+        on_delay_ms: 0,
+        off_delay_ms: 0,
+        latch: false,
+        suppressed_by: NO_START,
+        bit: Some(11),
+        text: "The module is not set up as the configuration wants it, and could not be made so.",
+        action: "See in the events what differs; change the configuration, or let it configure the module.",
+    },
 ];
+
+/// Whether a condition is watched of an esd module: those that are about CANopen are not.
+#[must_use]
+pub fn is_of_module(condition: BuiltIn) -> bool {
+    matches!(
+        condition,
+        BuiltIn::IdentityMismatch
+            | BuiltIn::NodeLost
+            | BuiltIn::NodeNeverSeen
+            | BuiltIn::Restarted
+            | BuiltIn::NotConfigured
+    )
+}

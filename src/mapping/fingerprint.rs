@@ -78,8 +78,9 @@ fn candidate(sighting: &Sighting, name: &str, text: &str) -> Option<Candidate> {
     let (table, _) = sketch.node("seen", sighting.node.get(), name, |_| ()).build().ok()?;
     let node = table.nodes.into_iter().next()?;
     let named = sighting.name.as_ref().map(|name| names(name, &node.device.model));
-    let by_frames = fit(sighting, &node.canopen, &node.device, named == Some(true));
-    let fit = match identity(&sighting.identity, &node.canopen) {
+    let canopen = node.protocol.canopen()?;
+    let by_frames = fit(sighting, canopen, &node.device, named == Some(true));
+    let fit = match identity(&sighting.identity, canopen) {
         Some(false) => return None,
         Some(true) if named != Some(false) => Some(Fit::Certain),
         Some(true) => Some(Fit::Probable),

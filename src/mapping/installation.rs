@@ -1,7 +1,9 @@
-//! The `[bus.*]` and `[node.*]` tables of the configuration.
+//! The `[bus.*]` and `[node.*]` tables of the configuration; `esd`: what they say of esd modules.
 //!
 //! Numbers are read wide and checked by [`build`](super::build()), so that a value out of its range is told together with all
 //! other problems. `None` means "what the mapping says, else the default".
+
+mod esd;
 
 use std::collections::BTreeMap;
 
@@ -9,9 +11,15 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::At;
+pub use super::offset::Offset;
 use super::table::OnLoss;
 use crate::canopen::{Role, TogglePolicy};
 use crate::process_image::Priority;
+
+pub use esd::{
+    ChannelEntry, EncodingOfLineWord, EndMarkWord, EsdEntry, FlowControlWord, HighHalfWord, ParityWord,
+    WatchdogWord,
+};
 
 /// `[bus.NAME]`.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
@@ -36,6 +44,8 @@ pub struct BusEntry {
     pub sync: Option<At<SyncEntry>>,
     /// TIME: tells the devices the time. Default: none.
     pub time: Option<At<TimeEntry>>,
+    /// Modules of esd: how they are managed. Default: not at all.
+    pub esd: Option<At<EsdEntry>>,
 }
 
 impl BusEntry {
@@ -51,6 +61,7 @@ impl BusEntry {
             own_heartbeat_ms: None,
             sync: None,
             time: None,
+            esd: None,
         }
     }
 }
@@ -62,13 +73,14 @@ pub struct SyncEntry {
     /// Who sends it. Default: gateway; in the passive role it never does.
     #[serde(default)]
     pub producer: ProducerWord,
-    /// Time between two, 1..=60000 ms; or `period_us`. Where another sends it: what is to be expected, if it is known.
+    /// Time between two, 1..=60000 ms; or `period_us`. Where another sends it: what is to be expected, if it is known. 0 = no
+    /// SYNC; where another sends it, not known.
     pub period_ms: Option<At<u64>>,
-    /// The same in microseconds, 1000..=60000000.
+    /// The same in microseconds, 1000..=60000000, or 0.
     pub period_us: Option<At<u64>>,
     /// Its identifier; one above 0x7FF has 29 bits. Default: 0x80.
     pub cob_id: Option<At<u64>>,
-    /// Highest number of its counter, 2..=240; 0 = no counter, so no data. Default: 0.
+    /// Highest number of its counter, 2..=240; 0 = no counter, so no data. Only where the gateway sends it. Default: 0.
     pub counter: Option<At<u64>>,
     /// A synchronous TPDO that comes later after SYNC is told of, 1..=60000000 us; 0 = not looked at. Default: 0.
     pub window_us: Option<At<u64>>,
@@ -124,14 +136,15 @@ impl From<RoleWord> for Role {
 pub struct NodeEntry {
     /// Name of its bus.
     pub bus: At<String>,
-    /// CANopen node id, 1..=127. It has no default (R-DET-005).
+    /// CANopen node id, 1..=127, or number of an esd module, 1..=254. It has no default (R-DET-005, R-ESD-049).
     pub id: At<u64>,
     /// Device mapping: the name of a file in `mappings/`, or a path.
     pub mapping: At<String>,
-    /// Modbus unit id, 1..=247 without that of the gateway itself. Default: the node id.
+    /// Modbus unit id, 1..=247 without that of the gateway itself. Default: the `id`.
     pub unit_id: Option<At<u64>>,
-    /// Added to every Modbus address, so that several nodes can share one unit id. Default: 0.
-    pub offset: Option<At<u64>>,
+    /// Added to every Modbus address, so that several nodes can share one unit id; or `"auto"`: behind the one before it
+    /// (R-ESD-118). Default: 0.
+    pub offset: Option<At<Offset>>,
     /// What Modbus shows of invalid data. Default: invalid.
     #[serde(default)]
     pub on_loss: OnLossWord,
@@ -188,10 +201,30 @@ pub struct NodeEntry {
     pub strict_dlc: Option<bool>,
     /// Send the node the RPDOs of its mapping. Default: false.
     #[serde(default)]
-    pub outputs: bool,
+    pub outputs: At<bool>,
     /// Changes to TPDOs of the mapping, by their number.
     #[serde(default)]
     pub tpdo: BTreeMap<At<String>, TpdoEntry>,
+    /// What the coding switch of an esd module says, 1..=0xCB, of a SIO1 1..=0xCC (R-ESD-021). Default: the `id`.
+    pub coding_switch: Option<At<u64>>,
+    /// Supervise and configure an esd module by commands. Default: true where its bus has a `reply_id` and the gateway is
+    /// master.
+    pub manage: Option<At<bool>>,
+    /// First Tx activate delay that an esd module is to have, 0..=65535 ms (R-ESD-090). Default: as it has it.
+    pub first_tx_delay_ms: Option<At<u64>>,
+    /// How often an esd module is asked for its status, 100..=60000 ms. Default: 2000.
+    pub status_period_ms: Option<At<u64>>,
+    /// Identifier of the watchdog of an esd module, 0x001..=0x7FF (R-ESD-082). Default: no watchdog.
+    pub watchdog_id: Option<At<u64>>,
+    /// Time between two requests of the watchdog, 20..=65535 ms (R-ESD-087). Default: 1000.
+    pub watchdog_ms: Option<At<u64>>,
+    /// After so many times this without a request the module resets itself, 1..=255 (R-ESD-087). Default: 3.
+    pub watchdog_factor: Option<At<u64>>,
+    /// How the watchdog is asked. Default: remote.
+    pub watchdog_by: Option<At<WatchdogWord>>,
+    /// Serial lines of an esd module that are used, by their number.
+    #[serde(default)]
+    pub channel: BTreeMap<At<String>, ChannelEntry>,
     /// Changes to tags of the mapping.
     #[serde(default)]
     pub tag: BTreeMap<At<String>, TagEntry>,

@@ -29,6 +29,7 @@ pub mod file;
 pub mod fingerprint;
 pub mod installation;
 pub mod objection;
+mod offset;
 pub mod reader;
 pub mod shipped;
 pub mod suggest;
@@ -38,7 +39,7 @@ pub mod testing;
 pub mod unit;
 
 pub use at::At;
-pub use build::{Installation, Sketch, build, check_mapping, is_name, sort_problems};
+pub use build::{Installation, Sketch, build, check_mapping, is_name, share_port, sort_problems};
 pub use diagnostic::{Diagnostic, Severity, SourceText};
 pub use expression::Expression;
 pub use objection::Objection;
@@ -46,8 +47,10 @@ pub use reader::{is_mapping, locate};
 pub use shipped::shipped;
 pub use table::{
     AlarmCondition, AlarmDef, AlarmOwner, BuiltIn, BusDef, DEVICE_UNIT, Derived, DeviceDef, DeviceUnit,
-    EmergencyDef, EmergencyPart, Encoding, ErrorDef, Field, FieldKind, NodeDef, OnLoss, PublishDef, Reading,
-    RegisterDef, RpdoDef, Scale, Source, Space, TagDef, TagTable, Told, WriteLimits,
+    EmergencyDef, EmergencyPart, Encoding, ErrorDef, EsdBusDef, Field, FieldKind, LineDef, LineEncoding,
+    LineMqtt, LineTcp, LineText, LineValue, ModuleCarrier, ModuleValue, NodeDef, OnLoss, Protocol,
+    PublishDef, ReadOnly, Reading, RegisterDef, RpdoDef, Scale, Source, Space, TagDef, TagTable, Told,
+    WriteLimits, Writing,
 };
 
 /// JSON Schema of a device mapping, for editors.

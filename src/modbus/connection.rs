@@ -3,33 +3,40 @@
 //! Registers are answered at once. An object of a node takes as long as the node does; the requests behind it wait.
 
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio_util::sync::CancellationToken;
 
+use super::accounts::{Accounts, Opened};
+use super::caller::Caller;
 use super::counters::{Counters, End};
 use super::frame::{self, Frame, LONGEST_FRAME, Parsed};
 use super::general_reference::{self, Reference};
 use super::pdu::{self, ExceptionCode};
 use super::register_bank::RegisterBank;
 use super::service;
-use crate::gateway::command::{CommandSource, Desk};
-use crate::process_image::ImageReader;
-use crate::slots::Activity;
+use super::writers::{Asking, Writers};
+use crate::gateway::command::{Authority, CommandSource, Desk};
+use crate::process_image::{Current, ImageReader};
+use crate::slots::{Bucket, Leave, Place, Rate};
 use crate::time::Clock;
 
 /// What all connections share.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Shared {
     /// Registers.
-    pub bank: RegisterBank,
+    pub bank: Arc<RegisterBank>,
     /// Values.
     pub reader: ImageReader,
     /// Time.
     pub clock: Clock,
     /// Counters.
-    pub counters: std::sync::Arc<Counters>,
+    pub counters: Arc<Counters>,
+    /// Counters of each client.
+    pub accounts: Arc<Accounts>,
+    /// How often a connection may ask, unless its client has a reserved place.
+    pub rate: Option<Rate>,
     /// How long a connection may be silent.
     pub idle_timeout: Option<Duration>,
     /// How long a request may stay incomplete.
@@ -38,6 +45,8 @@ pub struct Shared {
     pub send_timeout: Duration,
     /// FC 43/13, where it is offered.
     pub objects: Option<Objects>,
+    /// Who may write.
+    pub writers: Option<Writers>,
 }
 
 /// Objects of nodes.
@@ -55,35 +64,51 @@ const INPUT: usize = 4_096;
 /// cannot make the server hoard them.
 const OUTPUT: usize = 16_384;
 
-/// Serves a client until it, the network, a time-out or one of `stops` ends it.
-pub async fn serve<S>(stream: S, peer: SocketAddr, shared: &Shared, activity: &Activity, stops: &Stops) -> End
+/// Serves a client until it, the network or a time-out ends it, or its place is wanted.
+pub async fn serve<S>(stream: S, peer: SocketAddr, current: &Current<Shared>, place: &Place) -> End
+where
+    S: AsyncReadExt + AsyncWriteExt + Unpin,
+{
+    serve_as(stream, peer, Caller::WITHOUT_TLS, current, place).await
+}
+
+/// The same for one of whom more is known.
+pub async fn serve_as<S>(
+    stream: S,
+    peer: SocketAddr,
+    caller: Caller,
+    current: &Current<Shared>,
+    place: &Place,
+) -> End
 where
     S: AsyncReadExt + AsyncWriteExt + Unpin,
 {
     let input = vec![0; INPUT];
     let output = Vec::with_capacity(OUTPUT + LONGEST_FRAME);
-    let mut connection = Connection { stream, peer, shared, activity, input, filled: 0, output };
+    let shared = current.get();
+    let account = shared.accounts.open(peer.ip());
+    let (bucket, filled) = (Bucket::default(), 0);
+    let mut connection =
+        Connection { stream, peer, caller, account, bucket, current, shared, place, input, filled, output };
     tokio::select! {
         end = connection.run() => end,
-        () = stops.evict.cancelled() => End::Evicted,
-        () = stops.stop.cancelled() => End::Stopped,
+        leave = place.must_leave() => match leave {
+            Leave::Evicted => End::Evicted,
+            Leave::Stopped => End::Stopped,
+        },
     }
-}
-
-/// What ends a connection from outside.
-#[derive(Clone, Debug)]
-pub struct Stops {
-    /// It has to make room.
-    pub evict: CancellationToken,
-    /// The gateway stops.
-    pub stop: CancellationToken,
 }
 
 struct Connection<'a, S> {
     stream: S,
     peer: SocketAddr,
-    shared: &'a Shared,
-    activity: &'a Activity,
+    caller: Caller,
+    account: Opened,
+    bucket: Bucket,
+    current: &'a Current<Shared>,
+    /// Of the moment at which the request that is worked off was looked at.
+    shared: Arc<Shared>,
+    place: &'a Place,
     /// Of fixed length; `filled` bytes of it are not answered yet.
     input: Vec<u8>,
     filled: usize,
@@ -96,8 +121,12 @@ enum Progress {
     Done { any: bool },
     /// There may be more, but the answers must leave first.
     Full,
+    /// The next request has to wait, as they come faster than they may; the answers before it are to leave.
+    Wait(Duration),
     /// The next answer takes its time; those before it are to leave.
     Object(Asked),
+    /// As is this one's, of a client that may write.
+    Write(u16, Asking),
     /// What came is no Modbus.
     Malformed,
 }
@@ -121,9 +150,19 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
                 }
                 match progress {
                     Progress::Full => partial_until = None,
+                    Progress::Wait(wait) => {
+                        partial_until = None;
+                        self.shared.counters.delayed();
+                        self.account.delayed();
+                        tokio::time::sleep(wait).await;
+                    }
                     Progress::Object(asked) => {
                         partial_until = None;
                         self.answer_object(&asked).await;
+                    }
+                    Progress::Write(transaction, asking) => {
+                        partial_until = None;
+                        self.answer_write(transaction, &asking).await;
                     }
                     Progress::Malformed => return End::Malformed,
                     Progress::Done { any } => {
@@ -160,6 +199,7 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
 
     /// Answers the complete requests of the input into the output, and moves what is left to the beginning.
     fn answer(&mut self) -> Progress {
+        self.shared = self.current.get();
         let mut used = 0;
         let mut any = false;
         let progress = loop {
@@ -174,16 +214,37 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
                     used += length;
                 }
                 Parsed::Frame(request) => {
+                    if let Some(wait) = wait(&mut self.bucket, &self.shared, self.peer) {
+                        break Progress::Wait(wait);
+                    }
                     used += request.length();
+                    if !self.caller.rights.allow(request.pdu) {
+                        let (transaction, unit) = (request.transaction, request.unit);
+                        let function = request.pdu.first().copied().unwrap_or_default();
+                        self.tell_refused(&request, "its role has no right to this in [modbus.security]");
+                        self.forbid(transaction, unit, function);
+                        any = true;
+                        continue;
+                    }
                     if let Some(asked) = self.object_request(&request) {
                         break Progress::Object(asked);
                     }
-                    let Shared { bank, reader, clock, counters, .. } = self.shared;
+                    if general_reference::is_general_reference(request.pdu) {
+                        self.tell_refused(&request, "`canopen_objects` is \"off\"");
+                    }
+                    let writers = self.shared.writers.as_ref();
+                    let (unit, pdu) = (request.unit, request.pdu);
+                    if let Some(asking) = writers
+                        .and_then(|writers| writers.take(&self.shared, (self.peer, &self.caller), unit, pdu))
+                    {
+                        break Progress::Write(request.transaction, asking);
+                    }
+                    let Shared { bank, reader, clock, .. } = &*self.shared;
                     let now = clock.now();
                     let output = &mut self.output;
                     let exception = reader.read(|image| service::answer(bank, image, now, &request, output));
-                    counters.request(exception);
-                    self.activity.touch(now.instant);
+                    self.count(exception);
+                    self.place.touch(now.instant);
                 }
             }
             any = true;
@@ -191,6 +252,28 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
         self.input.copy_within(used..self.filled, 0);
         self.filled -= used;
         progress
+    }
+
+    fn count(&self, exception: Option<ExceptionCode>) {
+        self.shared.counters.request(exception);
+        self.account.request(exception.is_some());
+    }
+
+    /// Answers a request that its client may not make: exception 01, before anything else is looked at (MBS R-31).
+    fn forbid(&mut self, transaction: u16, unit: u8, function: u8) {
+        frame::write(&mut self.output, transaction, unit, |out| {
+            pdu::write_exception(out, function, ExceptionCode::IllegalFunction);
+        });
+        self.count(Some(ExceptionCode::IllegalFunction));
+        self.shared.counters.forbidden();
+        self.place.touch(self.shared.clock.now().instant);
+    }
+
+    /// Tells of a request that its client has no right to.
+    fn tell_refused(&self, request: &Frame<'_>, why: &str) {
+        if let Some(writers) = &self.shared.writers {
+            writers.refuse((self.peer.to_string(), &self.caller), request.unit, request.pdu, why);
+        }
     }
 
     /// Whether a request is for an object, and is to be asked of the gateway. One that is wrong is answered at once.
@@ -202,6 +285,8 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
 
     /// Appends the answer to a request for an object, once the gateway has given it.
     async fn answer_object(&mut self, asked: &Asked) {
+        // While the device is asked, which can take seconds, its client is not one that has long been silent.
+        self.place.touch(self.shared.clock.now().instant);
         let result = self.ask_for_object(asked).await;
         let mut exception = None;
         frame::write(&mut self.output, asked.transaction, asked.unit, |out| match result {
@@ -211,24 +296,44 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
                 exception = Some(code);
             }
         });
-        self.shared.counters.request(exception);
-        self.activity.touch(self.shared.clock.now().instant);
+        self.count(exception);
+        self.place.touch(self.shared.clock.now().instant);
     }
 
     /// In the order of the other functions: unit (0B), value (03), address (02).
     async fn ask_for_object(&self, asked: &Asked) -> Result<Vec<u8>, ExceptionCode> {
-        let Shared { bank, objects, .. } = self.shared;
+        let Shared { bank, objects, .. } = &*self.shared;
         let objects = objects.as_ref().ok_or(ExceptionCode::IllegalFunction)?;
         bank.map().unit(asked.unit).ok_or(ExceptionCode::GatewayTargetDevice)?;
         let reference = asked.reference.as_ref().ok_or(ExceptionCode::IllegalDataValue)?;
+        let source = CommandSource::modbus(self.peer.to_string());
         if reference.writes() && !objects.write {
+            let text = format!("{}: `canopen_objects` is \"read\"", reference.object());
+            objects.desk.refuse(source, "sdo_write", text);
             return Err(ExceptionCode::IllegalDataValue);
         }
         let action = reference.action(bank.table(), asked.unit)?;
-        let outcome = objects.desk.ask(CommandSource::Modbus(self.peer.to_string()), action).await;
+        let opened = Authority::Objects { write: objects.write };
+        let outcome = objects.desk.ask(source, &opened, action).await;
         let mut pdu = Vec::new();
         reference.answer(&outcome, &mut pdu)?;
         Ok(pdu)
+    }
+
+    /// Appends the answer to a write, once the gateway has given it.
+    async fn answer_write(&mut self, transaction: u16, asking: &Asking) {
+        self.place.touch(self.shared.clock.now().instant);
+        let result = match &self.shared.writers {
+            Some(writers) => writers.answer(&self.shared, asking).await,
+            None => Err(ExceptionCode::IllegalFunction),
+        };
+        let function = asking.pdu.first().copied().unwrap_or_default();
+        frame::write(&mut self.output, transaction, asking.unit, |out| match &result {
+            Ok(pdu) => out.extend_from_slice(pdu),
+            Err(code) => pdu::write_exception(out, function, *code),
+        });
+        self.count(result.err());
+        self.place.touch(self.shared.clock.now().instant);
     }
 
     /// Sends all answers at once.
@@ -236,7 +341,12 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
         if self.output.is_empty() {
             return Ok(());
         }
-        let sent = tokio::time::timeout(self.shared.send_timeout, self.stream.write_all(&self.output)).await;
+        let sending = async {
+            self.stream.write_all(&self.output).await?;
+            // What TLS has made of it must leave too.
+            self.stream.flush().await
+        };
+        let sent = tokio::time::timeout(self.shared.send_timeout, sending).await;
         self.output.clear();
         match sent {
             Ok(Ok(())) => Ok(()),
@@ -246,31 +356,45 @@ impl<S: AsyncReadExt + AsyncWriteExt + Unpin> Connection<'_, S> {
     }
 }
 
+/// How long the next request has to wait; `None`: it was taken.
+fn wait(bucket: &mut Bucket, shared: &Shared, peer: SocketAddr) -> Option<Duration> {
+    let rate = shared.rate.filter(|_| !shared.accounts.is_reserved(Some(peer.ip())))?;
+    bucket.take(shared.clock.now().instant, rate).err()
+}
+
 #[cfg(test)]
-pub(super) mod tests {
-    use crate::mapping::TagTable;
-    use crate::modbus::{ModbusSettings, RegisterMap};
-    use crate::process_image::{ProcessImage, process_image};
-    use crate::slots::Slots;
+mod tests {
+    use crate::mapping::Sketch;
+    use crate::modbus::ModbusSettings;
+    use crate::modbus::fixture::{shared, shared_of};
+    use crate::slots::{Clients, Limits, ServerName};
 
     use super::*;
 
-    /// A gateway without nodes.
-    pub(in super::super) fn shared() -> Shared {
-        let table = std::sync::Arc::new(TagTable::default());
-        let settings = ModbusSettings::default();
-        let map = RegisterMap::build(&table, &settings, "cangate").unwrap();
-        let (_, reader) = process_image(ProcessImage::default());
-        Shared {
-            bank: RegisterBank::new(table, map.into()),
-            reader,
-            clock: Clock::start(),
-            counters: std::sync::Arc::default(),
-            idle_timeout: None,
-            partial_frame_timeout: settings.partial_frame_timeout(),
-            send_timeout: settings.send_timeout(),
-            objects: None,
-        }
+    const HOST: std::net::IpAddr = std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
+
+    fn clients(places: usize) -> Clients {
+        let stop = tokio_util::sync::CancellationToken::new();
+        Clients::new(ServerName::new("Modbus", "[modbus]"), Limits::places(places), stop)
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn who_waits_for_an_object_is_not_taken_for_one_who_never_asked() {
+        let (near, mut far) = tokio::io::duplex(64);
+        let (desk, mut commands) = Desk::new(1);
+        let table = Sketch::new().node("node001", 1, "danfoss-dst-p92c", |_| ()).build().unwrap().0;
+        let shared = Shared { objects: Some(Objects { desk, write: false }), ..shared_of(table) };
+        let clients = clients(2);
+        let [asks, sits_there] = [(); 2].map(|()| clients.take(HOST));
+        let peer = SocketAddr::new(HOST, 1);
+        let serving = tokio::spawn(async move { serve(near, peer, &shared.into(), &asks).await });
+        // Unit 1, object 0x1000 of node 1.
+        far.write_all(&[0, 1, 0, 0, 0, 13, 1, 0x2B, 0x0D, 0, 0, 1, 0x10, 0, 0, 0, 0, 0, 4]).await.unwrap();
+        let waiting = commands.recv().await.unwrap();
+        let _newcomer = clients.take(HOST);
+        assert_eq!(sits_there.must_leave().await, Leave::Evicted);
+        drop((waiting, far));
+        assert_ne!(serving.await.unwrap(), End::Evicted);
     }
 
     #[tokio::test(start_paused = true)]
@@ -286,13 +410,37 @@ pub(super) mod tests {
             }
             sent
         });
-        let activity = Slots::new(1).take([127, 0, 0, 1].into(), ()).activity;
-        let stops = Stops { evict: CancellationToken::new(), stop: CancellationToken::new() };
-        let peer = SocketAddr::from(([127, 0, 0, 1], 1));
-        assert_eq!(serve(near, peer, &shared, &activity, &stops).await, End::SlowClient);
+        let (place, peer) = (clients(1).take(HOST), SocketAddr::new(HOST, 1));
+        assert_eq!(serve(near, peer, &shared.clone().into(), &place).await, End::SlowClient);
         assert_eq!(shared.clock.now().instant.as_millis(), 5_000);
         let answered = usize::try_from(shared.counters.values().requests).unwrap();
         assert!(answered <= OUTPUT / 209 + 1, "{answered} answers");
         assert!(asking.await.unwrap() <= answered + INPUT / 12 + 64 / 12 + 1);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn cr_7_1_who_asks_faster_than_it_may_is_answered_later_and_in_full_but_reserved_clients_at_once() {
+        for (reserved, millis, delayed) in [(vec![], 1_500, 15), (vec!["127.0.0.1".parse().unwrap()], 0, 0)] {
+            let settings = ModbusSettings { max_requests_per_s: 10, reserved, ..ModbusSettings::default() };
+            let accounts = Accounts::new(settings.reserved.clone()).into();
+            let shared = Shared { rate: settings.rate(), accounts, ..shared() };
+            let (near, mut far) = tokio::io::duplex(4_096);
+            let (place, peer, current) =
+                (clients(1).take(HOST), SocketAddr::new(HOST, 1), shared.clone().into());
+            let clock = shared.clock;
+            let asking = async move {
+                // Unit 247, the test pattern: 12 bytes for 11.
+                far.write_all(&[0, 1, 0, 0, 0, 6, 247, 4, 0, 90, 0, 1].repeat(25)).await.unwrap();
+                let mut answers = vec![0; 25 * 11];
+                far.read_exact(&mut answers).await.unwrap();
+                (answers, clock.now().instant.as_millis())
+            };
+            let (end, (answers, at)) = tokio::join!(serve(near, peer, &current, &place), asking);
+            assert_eq!((end, at), (End::Closed, millis));
+            assert_eq!(answers, [0, 1, 0, 0, 0, 5, 247, 4, 2, 0x12, 0x34].repeat(25));
+            let (values, client) = (shared.counters.values(), shared.accounts.values()[0]);
+            assert_eq!((values.requests, values.exceptions), (25, [0; 12]));
+            assert_eq!((values.delayed, client.delayed), (delayed, delayed));
+        }
     }
 }

@@ -16,7 +16,11 @@ pub struct Counters {
     requests: AtomicU64,
     exceptions: [AtomicU64; HIGHEST_CODE + 1],
     foreign_frames: AtomicU64,
-    ended: [AtomicU64; 8],
+    forbidden: AtomicU64,
+    delayed: AtomicU64,
+    turned_away: AtomicU64,
+    rtu_discarded: AtomicU64,
+    ended: [AtomicU64; 9],
 }
 
 /// Why a connection ended.
@@ -38,11 +42,13 @@ pub enum End {
     Evicted,
     /// The gateway stops.
     Stopped,
+    /// There was no TLS, or its certificate was refused.
+    Handshake,
 }
 
 impl End {
     /// All of them.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::Closed,
         Self::Broken,
         Self::Malformed,
@@ -51,6 +57,7 @@ impl End {
         Self::SlowClient,
         Self::Evicted,
         Self::Stopped,
+        Self::Handshake,
     ];
 
     /// The word in metrics and logs.
@@ -65,6 +72,7 @@ impl End {
             Self::SlowClient => "slow_client",
             Self::Evicted => "evicted",
             Self::Stopped => "stopped",
+            Self::Handshake => "handshake",
         }
     }
 
@@ -88,8 +96,16 @@ pub struct CounterValues {
     pub exceptions: [u64; HIGHEST_CODE + 1],
     /// Frames of other protocols, passed over.
     pub foreign_frames: u64,
+    /// Of the requests: those that their client had no right to.
+    pub forbidden: u64,
+    /// Of the requests: those that waited, as their client asks faster than it may.
+    pub delayed: u64,
+    /// Connections that were not let in: not allowed, or no place.
+    pub turned_away: u64,
+    /// Frames on serial lines with a wrong check.
+    pub rtu_discarded: u64,
     /// Connections ended, in the order of [`End::ALL`].
-    pub ended: [u64; 8],
+    pub ended: [u64; 9],
 }
 
 impl CounterValues {
@@ -109,15 +125,10 @@ fn count(counter: &AtomicU64) {
 }
 
 impl Counters {
-    /// A connection was accepted; `open` are open now.
-    pub fn accepted(&self, open: usize) {
+    /// A connection was accepted.
+    pub fn accepted(&self) {
         count(&self.accepted);
-        self.set_open(open);
-    }
-
-    /// So many connections are open.
-    pub fn set_open(&self, open: usize) {
-        self.open.store(u64::try_from(open).unwrap_or(u64::MAX), Ordering::Relaxed);
+        count(&self.open);
     }
 
     /// Accepting failed.
@@ -138,8 +149,29 @@ impl Counters {
         count(&self.foreign_frames);
     }
 
-    /// A connection ended.
+    /// So many frames on serial lines were thrown away because their check was wrong.
+    pub fn rtu_discarded(&self, more: u64) {
+        self.rtu_discarded.fetch_add(more, Ordering::Relaxed);
+    }
+
+    /// A connection was not let in.
+    pub fn turned_away(&self) {
+        count(&self.turned_away);
+    }
+
+    /// A request was answered 01 because its client had no right to it.
+    pub fn forbidden(&self) {
+        count(&self.forbidden);
+    }
+
+    /// A request has to wait, as its client asks faster than it may.
+    pub fn delayed(&self) {
+        count(&self.delayed);
+    }
+
+    /// A connection that was accepted has ended.
     pub fn ended(&self, end: End) {
+        self.open.fetch_sub(1, Ordering::Relaxed);
         if let Some(counter) = self.ended.get(end.place()) {
             count(counter);
         }
@@ -156,6 +188,10 @@ impl Counters {
             requests: value(&self.requests),
             exceptions: self.exceptions.each_ref().map(value),
             foreign_frames: value(&self.foreign_frames),
+            forbidden: value(&self.forbidden),
+            delayed: value(&self.delayed),
+            turned_away: value(&self.turned_away),
+            rtu_discarded: value(&self.rtu_discarded),
             ended: self.ended.each_ref().map(value),
         }
     }
@@ -172,10 +208,13 @@ mod tests {
         counters.request(Some(ExceptionCode::IllegalDataAddress));
         counters.request(Some(ExceptionCode::GatewayTargetDevice));
         counters.request(Some(ExceptionCode::Custom(99)));
+        counters.accepted();
+        counters.accepted();
         counters.ended(End::Idle);
         let values = counters.values();
+        assert_eq!((values.accepted, values.open), (2, 1));
         assert_eq!(values.requests, 4);
         assert_eq!(values.exceptions, [1, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 1]);
-        assert_eq!(End::ALL.map(|end| values.ended(end)), [0, 0, 0, 1, 0, 0, 0, 0]);
+        assert_eq!(End::ALL.map(|end| values.ended(end)), [0, 0, 0, 1, 0, 0, 0, 0, 0]);
     }
 }

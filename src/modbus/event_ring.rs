@@ -89,7 +89,7 @@ impl EventCodes {
     #[must_use]
     pub fn new(table: &TagTable) -> Self {
         let number = |place: usize| u16::try_from(place + 1).unwrap_or(u16::MAX);
-        let node = |node: &crate::mapping::NodeDef| (u16::from(node.canopen.id.get()), number(node.bus.0));
+        let node = |node: &crate::mapping::NodeDef| (u16::from(node.number()), number(node.bus.0));
         Self {
             nodes: table.nodes.iter().map(|def| (def.name.clone(), node(def))).collect(),
             buses: table
@@ -100,6 +100,12 @@ impl EventCodes {
                 .collect(),
             alarms: table.alarms.iter().map(|alarm| (alarm_code(alarm), instance(table, alarm))).collect(),
         }
+    }
+
+    /// The number of an alarm, by its place in the table.
+    #[must_use]
+    pub fn code(&self, alarm: usize) -> Option<u16> {
+        self.alarms.get(alarm).map(|(code, _)| *code)
     }
 
     /// A field of the record at `place`, 0..32.
@@ -155,6 +161,13 @@ fn alarm_code(alarm: &AlarmDef) -> u16 {
         AlarmCondition::BuiltIn(BuiltIn::ForeignMaster) => 107,
         AlarmCondition::BuiltIn(BuiltIn::ForeignProducer) => 108,
         AlarmCondition::BuiltIn(BuiltIn::MqttDown) => 201,
+        AlarmCondition::BuiltIn(BuiltIn::ConfigurationRejected) => 203,
+        AlarmCondition::BuiltIn(BuiltIn::CertificateExpires) => 211,
+        AlarmCondition::BuiltIn(BuiltIn::CertificateExpiresSoon) => 212,
+        AlarmCondition::BuiltIn(BuiltIn::CertificateExpired) => 213,
+        AlarmCondition::BuiltIn(BuiltIn::AccessRefused) => 202,
+        AlarmCondition::BuiltIn(BuiltIn::BufferFilling) => 204,
+        AlarmCondition::BuiltIn(BuiltIn::BufferFault) => 205,
         AlarmCondition::BuiltIn(_) | AlarmCondition::Tags(_) => u16::MAX,
     }
 }

@@ -238,8 +238,9 @@ impl GatewayView<'_> {
 
     /// Word `word` of a bitmap by node id. Two buses may have a node of the same id: then the bit needs both.
     fn bitmap(&self, word: u8, such: impl Fn(usize) -> bool) -> u16 {
-        let id = |node: &NodeDef| node.canopen.id.get();
-        let in_word = |node: &NodeDef| id(node) / 16 == word;
+        let id = |node: &NodeDef| node.canopen().map_or(0, |settings| settings.id.get());
+        // A module has no node id: its number is another kind of number.
+        let in_word = |node: &NodeDef| node.canopen().is_some() && id(node) / 16 == word;
         let bits = |wanted: bool| {
             let nodes = self.table.nodes.iter().enumerate();
             nodes

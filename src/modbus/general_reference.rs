@@ -109,11 +109,17 @@ impl Reference {
         self.control & WRITE != 0
     }
 
+    /// The object.
+    #[must_use]
+    pub fn object(&self) -> ObjectId {
+        self.object
+    }
+
     /// What the gateway is to be asked for. `unit` is where the request came to: a node's, which must be that of the request,
     /// or the gateway's own, where every node can be named.
     ///
     /// # Errors
-    /// 02: there is no such node there.
+    /// 02: there is no such node there, or there are several and the request names no network.
     pub fn action(&self, table: &TagTable, unit: u8) -> Result<Action, ExceptionCode> {
         let of_node = table.nodes.iter().any(|node| node.unit_id == unit);
         // The gateway itself does not know which bus is meant where there are several.
@@ -121,10 +127,14 @@ impl Reference {
         let mut found = table.nodes.iter().enumerate().filter(|(_, node)| {
             let there = if of_node { node.unit_id == unit } else { network.is_some() };
             there
-                && node.canopen.id.get() == self.node
+                && node.canopen().is_some_and(|settings| settings.id.get() == self.node)
                 && network.is_none_or(|network| node.bus.0 + 1 == network)
         });
         let (place, _) = found.next().ok_or(ExceptionCode::IllegalDataAddress)?;
+        // Two buses can each have a node of this id behind the unit id. Neither is taken at a venture.
+        if found.next().is_some() {
+            return Err(ExceptionCode::IllegalDataAddress);
+        }
         let (node, object, timeout) = (NodeIndex(place), self.object, None);
         Ok(if self.writes() {
             Action::SdoWrite { node, object, data: self.data.clone(), timeout }
@@ -146,6 +156,7 @@ impl Reference {
             Outcome::Read(bytes) => bytes,
             Outcome::Unknown
             | Outcome::Rejected(_)
+            | Outcome::Forbidden(_)
             | Outcome::Busy
             | Outcome::NodeUnavailable
             | Outcome::Aborted(_)
@@ -183,7 +194,7 @@ const HEADER: usize = 12;
 fn exception(outcome: &Outcome) -> ExceptionCode {
     match outcome {
         Outcome::Unknown => ExceptionCode::IllegalDataAddress,
-        Outcome::Rejected(_) => ExceptionCode::IllegalDataValue,
+        Outcome::Rejected(_) | Outcome::Forbidden(_) => ExceptionCode::IllegalDataValue,
         Outcome::Busy => ExceptionCode::ServerDeviceBusy,
         Outcome::NodeUnavailable => ExceptionCode::GatewayPathUnavailable,
         Outcome::Timeout => ExceptionCode::GatewayTargetDevice,

@@ -1,8 +1,10 @@
 //! FC 43/13 byte by byte.
 
 use super::*;
+use crate::can::BusIndex;
 use crate::gateway::command::AbortCode;
-use crate::mapping::Sketch;
+use crate::mapping::installation::{NodeEntry, Offset};
+use crate::mapping::{At, Sketch};
 
 fn bytes(hex: &str) -> Vec<u8> {
     let digits: String = hex.split_whitespace().collect();
@@ -21,13 +23,28 @@ fn answered(request: &str, outcome: &Outcome) -> Result<Vec<u8>, ExceptionCode> 
     reference(request).answer(outcome, &mut out).map(|()| out)
 }
 
-/// `node001` with unit id and node id 1, and two nodes that share unit id 9.
+/// A node with unit id and node id 1, and two nodes, 2 and 3, that share unit id 9.
 fn table() -> TagTable {
+    let shares = |offset| {
+        move |node: &mut NodeEntry| {
+            node.unit_id = Some(At::nowhere(9));
+            node.offset = Some(At::nowhere(Offset::Fixed(offset)));
+        }
+    };
     let sketch = Sketch::new().node("a", 1, "danfoss-dst-p92c", |_| ());
-    let sketch = sketch.node("b", 2, "motortech-detcon", |node| {
-        node.unit_id = Some(crate::mapping::At::nowhere(9));
-    });
-    sketch.build().unwrap().0
+    let sketch = sketch.node("b", 2, "motortech-detcon", shares(0));
+    sketch.node("c", 3, "danfoss-dst-p92c", shares(1000)).build().unwrap().0
+}
+
+/// The same, but that the last of them is node 2 of a second bus.
+fn table_of_two_buses() -> TagTable {
+    let mut table = table();
+    table.buses.push(table.buses[0].clone());
+    table.nodes[2].bus = BusIndex(1);
+    let id = table.nodes[1].canopen().unwrap().id;
+    let crate::mapping::Protocol::Canopen(settings) = &mut table.nodes[2].protocol else { panic!() };
+    settings.id = id;
+    table
 }
 
 #[test]
@@ -111,15 +128,33 @@ fn s1_what_is_not_well_formed_answers_03() {
 
 #[test]
 fn at_the_unit_id_of_a_node_only_that_node_can_be_named() {
-    let first = reference("2B 0D 00 00 01 1000 00 0000 0004");
-    let second = reference("2B 0D 00 00 02 1000 00 0000 0004");
+    let [first, second, third] =
+        [1, 2, 3].map(|node| reference(&format!("2B 0D 00 00 0{node} 1000 00 0000 0004")));
     assert!(first.action(&table(), 1).is_ok() && second.action(&table(), 9).is_ok());
+    assert!(third.action(&table(), 9).is_ok(), "of those that share a unit id each can be named");
     assert!(first.action(&table(), 0).is_ok() && second.action(&table(), 255).is_ok());
-    for (reference, unit) in [(&first, 9), (&second, 1)] {
+    for (reference, unit) in [(&first, 9), (&second, 1), (&third, 1)] {
         assert_eq!(reference.action(&table(), unit), Err(ExceptionCode::IllegalDataAddress));
     }
     let nobody = reference("2B 0D 00 00 00 1000 00 0000 0004");
     assert_eq!(nobody.action(&table(), 1), Err(ExceptionCode::IllegalDataAddress));
+}
+
+#[test]
+fn of_two_nodes_alike_behind_a_unit_id_neither_is_taken_at_a_venture() {
+    let table = table_of_two_buses();
+    for unit in [9, 247] {
+        let either = reference("2B 0D 00 00 02 1000 00 0000 0004");
+        assert_eq!(either.action(&table, unit), Err(ExceptionCode::IllegalDataAddress), "unit {unit}");
+        for (request, place) in
+            [("2B 0D 04 00 01 02 1000 00 0000 0004", 1), ("2B 0D 04 00 02 02 1000 00 0000 0004", 2)]
+        {
+            let Ok(Action::SdoRead { node, .. }) = reference(request).action(&table, unit) else {
+                panic!("{request}")
+            };
+            assert_eq!(node, NodeIndex(place), "unit {unit}");
+        }
+    }
 }
 
 #[test]

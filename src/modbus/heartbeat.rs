@@ -25,6 +25,14 @@ impl Heartbeats {
         Self { gateway: AtomicU16::new(0), nodes: (0..nodes).map(|_| AtomicU16::new(0)).collect() }
     }
 
+    /// Goes on where another's counters stood: `from` tells for each node its place there, where it has one.
+    pub fn go_on_from(&self, old: &Self, from: &[Option<NodeIndex>]) {
+        self.gateway.store(old.gateway(), Ordering::Relaxed);
+        for (counter, from) in self.nodes.iter().zip(from) {
+            counter.store(from.map_or(0, |from| old.node(from)), Ordering::Relaxed);
+        }
+    }
+
     /// To be called once a second: counts the gateway while its core runs, and each node whose data is processed and
     /// fresh.
     pub fn tick(&self, table: &TagTable, image: &ProcessImage, now: Now) {

@@ -54,7 +54,7 @@ impl Identification {
             (0x06, node.name.clone()),
             (0x80, hash_text(map_hash)),
             (0x81, MAP_VERSION.to_string()),
-            (0x82, node.canopen.id.get().to_string()),
+            (0x82, node.number().to_string()),
             (0x83, bus),
         ])
     }

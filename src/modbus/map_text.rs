@@ -54,6 +54,7 @@ const NODE: Column = ("Node", |point, _| point.node.clone());
 const DESCRIPTION: Column = ("Description", |point, _| point.description.clone());
 const SOURCE: Column = ("Source", |point, _| point.source.clone());
 const TOPIC: Column = ("Topic", |point, _| point.topic.clone());
+const COB_ID: Column = ("COB-ID", |point, _| point.cob_id.clone());
 const UNIT_ID: Column = ("Unit id", |point, _| point.unit_id.to_string());
 const TABLE: Column = ("Table", |point, _| point.table.word().to_owned());
 const WRITABLE: Column = ("Writable", |point, _| point.writable.to_string());
@@ -91,7 +92,7 @@ fn terminal(points: &[Point], map: &RegisterMap) -> String {
 }
 
 fn csv(points: &[Point], order: WordOrder) -> String {
-    const COLUMNS: [Column; 17] = [
+    const COLUMNS: [Column; 18] = [
         UNIT_ID,
         TABLE,
         ADDRESS,
@@ -109,8 +110,9 @@ fn csv(points: &[Point], order: WordOrder) -> String {
         DESCRIPTION,
         SOURCE,
         TOPIC,
+        COB_ID,
     ];
-    let heading = COLUMNS.map(|(name, _)| name.to_lowercase().replace(' ', "_")).join(",");
+    let heading = COLUMNS.map(|(name, _)| name.to_lowercase().replace([' ', '-'], "_")).join(",");
     let mut text = heading + "\n";
     for point in points {
         let cells: Vec<String> = cells(&COLUMNS, point, order).iter().map(|cell| quoted(cell)).collect();
@@ -334,6 +336,7 @@ mod tests {
             topic: "cangate/hall-1/engine1/state".into(),
             source: "TPDO1 byte 0".into(),
             description: "Knock, \"intensity\" | 1".into(),
+            cob_id: "0x181".into(),
         }
     }
 
@@ -454,12 +457,12 @@ mod tests {
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(
             lines[0],
-            "unit_id,table,address,number,reference,also_as,type,count,order,scale,unit,writable,node,tag,description,source,topic"
+            "unit_id,table,address,number,reference,also_as,type,count,order,scale,unit,writable,node,tag,description,source,topic,cob_id"
         );
         assert_eq!(
             lines[1],
             "1,input_register,100,101,300101,400101,u16,1,AB,0.01,%,false,engine1,a,\"Knock, \"\"intensity\"\" | 1\",\
-             TPDO1 byte 0,cangate/hall-1/engine1/state"
+             TPDO1 byte 0,cangate/hall-1/engine1/state,0x181"
         );
     }
 }

@@ -284,7 +284,7 @@ impl<'a> NodeView<'a> {
     #[must_use]
     pub fn is_fresh(&self) -> bool {
         let timeouts =
-            self.def.canopen.pdos.iter().enumerate().filter_map(|(place, pdo)| Some((place, pdo.timeout?)));
+            self.def.pdos().iter().enumerate().filter_map(|(place, pdo)| Some((place, pdo.timeout?)));
         self.status.online
             && timeouts.into_iter().all(|(place, timeout)| self.age(place) <= timeout.as_millis())
     }
@@ -298,6 +298,7 @@ impl<'a> NodeView<'a> {
         let tags = self.table.tags.get(self.def.tags.clone()).unwrap_or_default();
         tags.iter().zip(self.def.tags.clone()).all(|(tag, index)| {
             matches!(tag.source, Source::Derived(_) | Source::Rpdo { .. })
+                || !self.def.is_asked_for(&tag.source)
                 || self.image.tag(TagIndex(index)).quality.is_good()
         })
     }
@@ -311,14 +312,15 @@ impl<'a> NodeView<'a> {
             | Source::Polled { .. }
             | Source::Adopted { .. }
             | Source::Rpdo { .. }
-            | Source::Emergency { .. } => None,
+            | Source::Emergency { .. }
+            | Source::Module { .. } => None,
         })
     }
 
     /// A TPDO that the mapping has, and whose data is not to be used. It is enough to look at one of its tags, as all
     /// of them stand or fall together.
     fn pdo_is_stale(&self, number: u16) -> bool {
-        let Some(place) = self.def.canopen.pdos.iter().position(|pdo| pdo.number == number) else {
+        let Some(place) = self.def.pdos().iter().position(|pdo| pdo.number == number) else {
             return false;
         };
         let status = self.status.pdos.get(place);
@@ -328,12 +330,12 @@ impl<'a> NodeView<'a> {
     }
 
     fn oldest_age(&self) -> u128 {
-        let places = 0..self.def.canopen.pdos.len();
+        let places = 0..self.def.pdos().len();
         places.map(|place| self.age(place)).max().unwrap_or(u128::MAX)
     }
 
     fn pdo_age(&self, number: u16) -> u128 {
-        let place = self.def.canopen.pdos.iter().position(|pdo| pdo.number == number);
+        let place = self.def.pdos().iter().position(|pdo| pdo.number == number);
         place.map_or(u128::MAX, |place| self.age(place))
     }
 

@@ -4,12 +4,15 @@
 use serde::{Deserialize, Serialize};
 
 use super::WordOrder;
+use super::command_block;
 use super::event_ring;
 use super::gateway_block::{self, BUS_BLOCK, GATEWAY_BLOCK};
+use super::line_text;
 use super::node_block::{self, NODE_BLOCK, Row};
 use super::register_map::alarm_groups;
-use super::source::source_text;
-use crate::mapping::{DEVICE_UNIT, Encoding, NodeDef, RegisterDef, Space, TagDef, TagTable};
+use super::source::{cob_id, source_text};
+use super::writing::{ACKNOWLEDGE_ALL, Writable};
+use crate::mapping::{DEVICE_UNIT, Encoding, LineDef, NodeDef, RegisterDef, Space, TagDef, TagTable};
 use crate::process_image::{AlarmIndex, TagIndex};
 
 /// The map of an installation as `map --format json` prints it.
@@ -40,7 +43,7 @@ pub struct Point {
     pub address: u32,
     /// Registers, or bits.
     pub count: u16,
-    /// How the value is written; `event` is a record of the event ring.
+    /// How the value is written; `event` is a record of the event ring, `text` bytes, two in each register.
     #[serde(rename = "type")]
     pub kind: String,
     /// Engineering units per count.
@@ -57,6 +60,9 @@ pub struct Point {
     pub source: String,
     /// One sentence.
     pub description: String,
+    /// Identifier of the PDO that carries it, `0x306`; empty for none (R-ESD-124). It is no promise, and not part of the JSON.
+    #[serde(skip)]
+    pub cob_id: String,
 }
 
 /// A Modbus table. What can be read as an input register can be read as a holding register at the same address, and
@@ -136,6 +142,47 @@ pub fn points(table: &TagTable, gateway_unit_id: u8, base_topic: &str) -> Vec<Po
     points
 }
 
+/// Marks what can be written, and adds what only can be written: the command block and the coils.
+pub fn add_writes(points: &mut Vec<Point>, table: &TagTable, writable: &Writable, gateway_unit_id: u8) {
+    for def in writable.tags.iter().filter_map(|tag| table.tag(*tag)) {
+        let node = table.node(def.node).map_or("", |node| node.name.as_str());
+        let raw = [Encoding::Raw16, Encoding::Raw32].map(Encoding::word);
+        let of_tag =
+            |point: &&mut Point| point.node == node && point.tag == def.name && !raw.contains(&&*point.kind);
+        for point in points.iter_mut().filter(of_tag) {
+            point.writable = true;
+            point.table = point.table.twin();
+            point.reference = point.table.reference(point.address);
+        }
+    }
+    if !writable.commands {
+        return;
+    }
+    let gateway = Point { unit_id: gateway_unit_id, source: "gateway".into(), ..Point::blank() };
+    for (place, name, writable, text) in command_block::ROWS {
+        let address = u32::from(command_block::ADDRESS + place);
+        points.push(Point {
+            tag: name.into(),
+            writable,
+            description: text.into(),
+            ..gateway.at(Table::HoldingRegister, address, Encoding::U16)
+        });
+    }
+    let coil = |blank: Point, text: &str| Point {
+        tag: "alarm.acknowledge_all".into(),
+        writable: true,
+        description: text.into(),
+        ..blank.at(Table::Coil, ACKNOWLEDGE_ALL.into(), Encoding::Bool)
+    };
+    points.push(coil(gateway.clone(), "1 acknowledges all alarms; write only"));
+    for node in &table.nodes {
+        if table.nodes.iter().filter(|other| other.unit_id == node.unit_id).count() == 1 {
+            let blank = Point { node: node.name.clone(), unit_id: node.unit_id, ..gateway.clone() };
+            points.push(coil(blank, "1 acknowledges all alarms of the node; write only"));
+        }
+    }
+}
+
 fn node_points(table: &TagTable, node: &NodeDef, topic: &str) -> Vec<Point> {
     let blank = Point { node: node.name.clone(), unit_id: node.unit_id, ..Point::blank() };
     let offset = u32::from(node.offset);
@@ -146,6 +193,9 @@ fn node_points(table: &TagTable, node: &NodeDef, topic: &str) -> Vec<Point> {
             points.push(tag_point(&blank, table, node, def, register, topic));
         }
     }
+    let is_of_node = |line: &&LineDef| table.node(line.node).is_some_and(|owner| owner.name == node.name);
+    let lines = table.lines.iter().filter(is_of_node);
+    points.extend(lines.flat_map(|line| line_text::points(&blank, node, line, topic)));
     for (bit, alarms) in alarm_groups(table, node) {
         let Some((name, text, topic)) = alarm_names(table, &alarms, topic) else { continue };
         let bits = [
@@ -181,6 +231,7 @@ fn tag_point(
         engineering_unit: if raw { String::new() } else { def.unit.clone() },
         topic: if def.published { format!("{topic}/state") } else { String::new() },
         source: source_text(table, node, &def.source),
+        cob_id: cob_id(node, &def.source).unwrap_or_default(),
         description: if raw {
             format!("{} (as on the bus)", def.description)
         } else if def.unit == DEVICE_UNIT && def.device_unit.is_some() {
@@ -253,11 +304,12 @@ impl Point {
             topic: String::new(),
             source: String::new(),
             description: String::new(),
+            cob_id: String::new(),
         }
     }
 
     /// The same, at an address.
-    fn at(&self, table: Table, address: u32, encoding: Encoding) -> Self {
+    pub(super) fn at(&self, table: Table, address: u32, encoding: Encoding) -> Self {
         Self {
             table,
             address,

@@ -5,11 +5,12 @@ use std::sync::Arc;
 use super::encoding::Cell;
 use super::gateway_block::{GatewayView, bus_register};
 use super::heartbeat::Heartbeats;
+use super::line_text;
 use super::node_block::NodeView;
 use super::pdu::ExceptionCode;
 use super::register_map::{BitShow, RegisterMap, RegisterShow, TagRegister, Unit};
 use crate::mapping::{OnLoss, TagTable};
-use crate::process_image::{AlarmIndex, AlarmState, ProcessImage, Quality, Sample, Value};
+use crate::process_image::{AlarmIndex, AlarmState, NodeIndex, ProcessImage, Quality, Sample, Value};
 use crate::time::Now;
 
 /// The register map joined to what it shows.
@@ -38,6 +39,11 @@ impl RegisterBank {
     #[must_use]
     pub fn map(&self) -> &RegisterMap {
         &self.map
+    }
+
+    /// The heartbeat registers go on where those of `old` stood; `from` tells for each node its place there.
+    pub fn go_on_from(&self, old: &Self, from: &[Option<NodeIndex>]) {
+        self.heartbeats.go_on_from(&old.heartbeats, from);
     }
 
     /// To be called once a second.
@@ -120,6 +126,7 @@ impl RegisterBank {
             RegisterShow::Bus(bus, show) => {
                 image.buses.get(*bus).map_or(Cell::Word(0), |bus| bus_register(bus, *show))
             }
+            RegisterShow::Line(register) => line_text::cell(image, register)?,
             RegisterShow::NewestEvent => Cell::low_double(image.journal.newest()),
             RegisterShow::Event(place, field) => self.map.events().register(image, *place, *field),
         })

@@ -6,8 +6,10 @@ use super::address_space::{AddressSpace, AddressSpaceBuilder};
 use super::event_ring::{self, EventCodes, EventField};
 use super::gateway_block::{self, BUS_BLOCK, BusRegister, GATEWAY_BLOCK, GatewayRegister, MAP_VERSION};
 use super::identification::Identification;
+use super::line_text::{self, LineRegister};
 use super::node_block::{self, NODE_BLOCK, NodeRegister};
 use super::points::{self, Point};
+use super::writing::Writable;
 use super::{ModbusSettings, WordOrder};
 use crate::mapping::{Encoding, NodeDef, OnLoss, RegisterDef, Space, TagTable};
 use crate::process_image::{AlarmIndex, NodeIndex, TagIndex};
@@ -20,6 +22,7 @@ pub struct RegisterMap {
     units: BTreeMap<u8, Unit>,
     events: EventCodes,
     points: Vec<Point>,
+    writable: Writable,
     hash: u64,
 }
 
@@ -45,6 +48,8 @@ pub enum RegisterShow {
     Gateway(GatewayRegister),
     /// A register of a bus, by its place in the configuration.
     Bus(usize, BusRegister),
+    /// A register of the last message of a serial line.
+    Line(LineRegister),
     /// Sequence number of the newest event.
     NewestEvent,
     /// A field of a record of the event ring.
@@ -137,8 +142,22 @@ impl RegisterMap {
     /// # Errors
     /// Two owners of one address, an address beyond the last, or a node on the gateway's unit id.
     pub fn build(table: &TagTable, settings: &ModbusSettings, base_topic: &str) -> Result<Self, MapError> {
+        Self::build_for(table, settings, base_topic, Writable::default())
+    }
+
+    /// The same where some of it can be written.
+    ///
+    /// # Errors
+    /// As [`build`](Self::build).
+    pub fn build_for(
+        table: &TagTable,
+        settings: &ModbusSettings,
+        base_topic: &str,
+        writable: Writable,
+    ) -> Result<Self, MapError> {
         let gateway_unit_id = settings.gateway_unit_id;
-        let points = points::points(table, gateway_unit_id, base_topic);
+        let mut points = points::points(table, gateway_unit_id, base_topic);
+        points::add_writes(&mut points, table, &writable, gateway_unit_id);
         let hash = points::hash(MAP_VERSION, &points, settings.word_order);
         let mut builders: BTreeMap<u8, UnitBuilder> = BTreeMap::new();
         for (index, node) in table.nodes.iter().enumerate() {
@@ -162,13 +181,39 @@ impl RegisterMap {
             units.insert(unit_id, unit);
         }
         let word_order = settings.word_order;
-        Ok(Self { gateway_unit_id, word_order, units, events: EventCodes::new(table), points, hash })
+        Ok(Self {
+            gateway_unit_id,
+            word_order,
+            units,
+            events: EventCodes::new(table),
+            points,
+            writable,
+            hash,
+        })
     }
 
     /// What a unit id shows; 0 and 255 are the gateway, as its own id is. `None` for an unknown one.
     #[must_use]
     pub fn unit(&self, unit_id: u8) -> Option<&Unit> {
         self.units.get(&if matches!(unit_id, 0 | 255) { self.gateway_unit_id } else { unit_id })
+    }
+
+    /// What can be written.
+    #[must_use]
+    pub fn writable(&self) -> &Writable {
+        &self.writable
+    }
+
+    /// The gateway's own unit id, beside 0 and 255.
+    #[must_use]
+    pub fn gateway_unit_id(&self) -> u8 {
+        self.gateway_unit_id
+    }
+
+    /// Whether a unit id is the gateway's.
+    #[must_use]
+    pub fn is_gateway(&self, unit_id: u8) -> bool {
+        matches!(unit_id, 0 | 255) || unit_id == self.gateway_unit_id
     }
 
     /// The unit ids, lowest first; 0 and 255 apart.
@@ -247,6 +292,16 @@ impl UnitBuilder {
                     }
                 }
             }
+        }
+        for (address, shown, owner) in line_text::of_node(table, index, node) {
+            let first = offset + u32::from(address);
+            let mut end = first;
+            for (address, register) in (first..).zip(shown) {
+                self.registers.show(address, 1, RegisterShow::Line(register));
+                end = address + 1;
+            }
+            registers_end = registers_end.max(end - offset);
+            self.registers.claim(first..end, owner);
         }
         self.registers.publish(offset..offset + registers_end.next_multiple_of(ROUND_REGISTERS));
         self.bits.publish(offset..offset + bits_end.next_multiple_of(ROUND_BITS));

@@ -1,65 +1,88 @@
-//! Listens, accepts, limits; survives whatever comes. \[IO\]
+//! Listens, and keeps the heartbeat registers. \[IO\]
 
-use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use nix::sys::socket::{setsockopt, sockopt};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::mpsc;
-use tokio::task::{JoinError, JoinSet};
+use tokio::task::JoinSet;
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use super::connection::{self, Objects, Shared, Stops};
-use super::counters::{Counters, End};
+use super::accounts::Accounts;
+use super::connection::{self, Objects, Shared};
+use super::counters::Counters;
 use super::register_bank::RegisterBank;
+use super::rtu::{self, RtuSettings};
+use super::security::{Door, SecuritySettings, door};
+use super::writers::Writers;
 use super::{ModbusSettings, ObjectAccess};
 use crate::gateway::command::Desk;
-use crate::process_image::ImageReader;
-use crate::slots::{SlotId, Slots};
+use crate::process_image::{Current, ImageReader};
+use crate::slots::{BindError, Clients, Limits, Place, Places, ServerName, Service, listening};
 use crate::time::Clock;
+use crate::tls::{ServerKeeper, TlsError};
 
 /// A Modbus TCP server that listens already.
 #[derive(Debug)]
 pub struct Server {
-    listeners: Vec<TcpListener>,
-    max_connections: usize,
-    shared: Shared,
+    plain: Plain,
     /// What is done with a desk, once there is one.
     objects: ObjectAccess,
+    lines: Lines,
+    security: Option<SecureServer>,
 }
 
-/// An address could not be listened on.
+/// Clients by TCP alone; and the heartbeat registers, which go on with it.
+#[derive(Debug)]
+pub struct Plain {
+    listeners: Vec<TcpListener>,
+    limits: Limits,
+    places: Places,
+    shared: Current<Shared>,
+}
+
+/// Modbus/TCP Security, listening already.
+#[derive(Debug)]
+pub struct SecureServer {
+    listeners: Vec<TcpListener>,
+    settings: SecuritySettings,
+    keeper: Arc<ServerKeeper>,
+    limits: Limits,
+    places: Places,
+    shared: Current<Shared>,
+}
+
+/// Serial lines.
+#[derive(Clone, Debug)]
+pub struct Lines {
+    settings: Vec<RtuSettings>,
+    shared: Current<Shared>,
+}
+
+/// Why Modbus/TCP Security cannot be served.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot listen for Modbus on {address}: {source}; {}", hint(source))]
-pub struct BindError {
-    /// The address.
-    pub address: SocketAddr,
-    /// What the system says.
-    pub source: io::Error,
+pub enum SecurityError {
+    /// An address.
+    #[error(transparent)]
+    Listen(#[from] BindError),
+    /// A file.
+    #[error("Modbus/TCP Security cannot be served: {0}")]
+    Files(#[from] TlsError),
 }
 
-fn hint(error: &io::Error) -> &'static str {
-    let kind = error.kind();
-    if kind == io::ErrorKind::AddrInUse {
-        "another program has this port: stop it, or change `listen` in [modbus]"
-    } else if kind == io::ErrorKind::PermissionDenied {
-        "ports below 1024 need a privilege: use port 5020, or allow it (net.ipv4.ip_unprivileged_port_start)"
-    } else if kind == io::ErrorKind::AddrNotAvailable {
-        "this host has no such address: change `listen` in [modbus]"
-    } else {
-        "check `listen` in [modbus]"
-    }
+fn name() -> ServerName {
+    ServerName::new("Modbus", "[modbus]")
 }
 
-/// Accepted connections that wait to be served. When full, accepting waits and the kernel's backlog holds the rest.
-const ACCEPTED: usize = 16;
-/// First pause after a failed accept; doubled at each further one.
-const ACCEPT_PAUSE: Duration = Duration::from_millis(10);
-/// Longest pause after a failed accept.
-const LONGEST_ACCEPT_PAUSE: Duration = Duration::from_secs(1);
+fn secure_name() -> ServerName {
+    ServerName::new("Modbus/TCP Security", "[modbus.security]")
+}
+
+/// Where clients with certificates are told of: who may come, and how many, stands in one table for both doors of TCP.
+fn secure_clients() -> ServerName {
+    ServerName::new(&secure_name().what, &name().table)
+}
 
 impl Server {
     /// Listens on every address of the settings.
@@ -72,34 +95,107 @@ impl Server {
         reader: ImageReader,
         clock: Clock,
     ) -> Result<Self, BindError> {
-        let mut listeners = Vec::new();
-        for address in &settings.listen {
-            let listener = TcpListener::bind(address).await;
-            listeners.push(listener.map_err(|source| BindError { address: *address, source })?);
-        }
-        let shared = Shared {
-            bank,
-            reader,
-            clock,
-            counters: Arc::new(Counters::default()),
-            idle_timeout: settings.idle_timeout(),
-            partial_frame_timeout: settings.partial_frame_timeout(),
-            send_timeout: settings.send_timeout(),
-            objects: None,
-        };
-        let max_connections = usize::from(settings.max_connections);
-        Ok(Self { listeners, max_connections, shared, objects: settings.canopen_objects })
+        let shared = Shared::new(settings, bank.into(), reader, clock);
+        Self::bind_shown(settings, shared.into()).await
     }
 
-    /// Asks for objects of nodes at this desk, as far as the settings allow it. Without a desk FC 43/13 is not offered.
+    /// The same with what it shows already made.
+    ///
+    /// # Errors
+    /// The first address that cannot be listened on.
+    pub async fn bind_shown(settings: &ModbusSettings, shared: Current<Shared>) -> Result<Self, BindError> {
+        let limits = settings.limits();
+        let plain = Plain::bind(settings, Places::new(&limits), shared.clone()).await?;
+        let lines = Lines { settings: settings.rtu.clone(), shared };
+        Ok(Self { plain, objects: settings.canopen_objects, lines, security: None })
+    }
+
+    /// Serves clients with certificates too, where the settings say so. They share the places of the others.
+    ///
+    /// # Errors
+    /// A file cannot be used, or an address cannot be listened on.
+    pub async fn with_security(mut self, settings: &SecuritySettings) -> Result<Self, SecurityError> {
+        let Plain { limits, places, shared, .. } = &self.plain;
+        if let Some(keeper) = door::prepare(settings, shared.get().clock).await? {
+            let places = (limits.clone(), places.clone());
+            self.security = Some(SecureServer::bind(settings, keeper, places, shared.clone()).await?);
+        }
+        Ok(self)
+    }
+
+    /// The addresses at which clients with certificates are served.
     #[must_use]
-    pub fn with_desk(mut self, desk: Desk) -> Self {
-        self.shared.objects = match self.objects {
-            ObjectAccess::Off => None,
-            ObjectAccess::Read => Some(Objects { desk, write: false }),
-            ObjectAccess::Write => Some(Objects { desk, write: true }),
-        };
+    pub fn secure_addrs(&self) -> Vec<SocketAddr> {
+        self.security.as_ref().map(SecureServer::local_addrs).unwrap_or_default()
+    }
+
+    /// Hands writes in at this desk, and asks for objects of nodes, as far as the settings allow it. Without a desk FC 43/13 is
+    /// not offered, and nothing is written.
+    #[must_use]
+    pub fn with_desk(self, desk: Desk) -> Self {
+        let shared = Shared::clone(&self.plain.shared.get());
+        self.plain.shared.set(shared.with_desk(self.objects, desk));
         self
+    }
+
+    /// What it shows, to exchange it while connections go on: each request is answered from one piece.
+    #[must_use]
+    pub fn shown(&self) -> Current<Shared> {
+        self.plain.shared.clone()
+    }
+
+    /// The addresses that it listens on, in the order of the settings; port 0 has become a real one.
+    #[must_use]
+    pub fn local_addrs(&self) -> Vec<SocketAddr> {
+        self.plain.local_addrs()
+    }
+
+    /// The counters, for metrics.
+    #[must_use]
+    pub fn counters(&self) -> Arc<Counters> {
+        Arc::clone(&self.plain.shared.get().counters)
+    }
+
+    /// The counters of each client, for metrics and the page.
+    #[must_use]
+    pub fn accounts(&self) -> Arc<Accounts> {
+        Arc::clone(&self.plain.shared.get().accounts)
+    }
+
+    /// Its doors, each of which can be run, and ended, by itself; and the places that both doors of TCP share.
+    #[must_use]
+    pub fn into_doors(self) -> (Plain, Option<SecureServer>, Lines, Places) {
+        let places = self.plain.places.clone();
+        (self.plain, self.security, self.lines, places)
+    }
+
+    /// Serves until `stop`. Connections end with it.
+    pub async fn run(self, stop: CancellationToken) {
+        let (plain, secure, lines, _) = self.into_doors();
+        let secure = async {
+            if let Some(secure) = secure {
+                secure.run(stop.clone()).await;
+            }
+        };
+        tokio::join!(plain.run(stop.clone()), secure, lines.run(stop.clone()));
+    }
+}
+
+impl Plain {
+    /// Listens on every address of the settings.
+    ///
+    /// # Errors
+    /// The first address that cannot be listened on.
+    pub async fn bind(
+        settings: &ModbusSettings,
+        places: Places,
+        shared: Current<Shared>,
+    ) -> Result<Self, BindError> {
+        let mut listeners = Vec::new();
+        for address in &settings.listen {
+            listeners.push(listening::bind(&name(), *address).await?);
+        }
+        Ok(Self { listeners, limits: settings.limits(), places, shared })
     }
 
     /// The addresses that it listens on, in the order of the settings; port 0 has become a real one.
@@ -108,258 +204,157 @@ impl Server {
         self.listeners.iter().filter_map(|listener| listener.local_addr().ok()).collect()
     }
 
-    /// The counters, for metrics.
+    /// Serves until `stop`. Connections end with it.
+    pub async fn run(self, stop: CancellationToken) {
+        let clients = Clients::at(name(), self.limits, self.places, stop);
+        let shared = self.shared;
+        tokio::select! {
+            () = listening::serve(self.listeners, clients, Arc::new(shared.clone())) => {}
+            () = beat(&shared) => {}
+        }
+    }
+}
+
+impl SecureServer {
+    /// Listens on every address of the settings, with files that were [prepared](door::prepare). `places`: who may come, and where.
+    ///
+    /// # Errors
+    /// The first address that cannot be listened on.
+    pub async fn bind(
+        settings: &SecuritySettings,
+        keeper: Arc<ServerKeeper>,
+        (limits, places): (Limits, Places),
+        shared: Current<Shared>,
+    ) -> Result<Self, BindError> {
+        let mut listeners = Vec::new();
+        for address in &settings.listen {
+            listeners.push(listening::bind(&secure_name(), *address).await?);
+        }
+        Ok(Self { listeners, settings: settings.clone(), keeper, limits, places, shared })
+    }
+
+    /// The addresses that it listens on.
     #[must_use]
-    pub fn counters(&self) -> Arc<Counters> {
-        Arc::clone(&self.shared.counters)
+    pub fn local_addrs(&self) -> Vec<SocketAddr> {
+        self.listeners.iter().filter_map(|listener| listener.local_addr().ok()).collect()
     }
 
     /// Serves until `stop`. Connections end with it.
     pub async fn run(self, stop: CancellationToken) {
-        let (accepted, mut newcomers) = mpsc::channel(ACCEPTED);
-        let mut acceptors = JoinSet::new();
-        for listener in self.listeners {
-            let counters = Arc::clone(&self.shared.counters);
-            acceptors.spawn(accept(listener, accepted.clone(), counters));
-        }
-        let mut clients = Clients {
-            slots: Slots::new(self.max_connections),
-            tasks: JoinSet::new(),
-            shared: Arc::new(self.shared),
-            stop,
-        };
-        let mut second = tokio::time::interval(Duration::from_secs(1));
-        second.set_missed_tick_behavior(MissedTickBehavior::Skip);
-        let stop = clients.stop.clone();
-        loop {
-            tokio::select! {
-                () = stop.cancelled() => break,
-                _ = second.tick() => clients.tick(),
-                Some(arrival) = newcomers.recv() => match arrival {
-                    Arrival::Client(stream, peer) => clients.admit(stream, peer).await,
-                    Arrival::NoDescriptor => clients.give_way().await,
-                },
-                Some(ended) = clients.tasks.join_next() => clients.ended(ended),
-            }
-        }
-        acceptors.abort_all();
-        while let Some(ended) = clients.tasks.join_next().await {
-            clients.ended(ended);
+        let clients = Clients::at(secure_clients(), self.limits, self.places, stop);
+        let door = Arc::new(Door::new(self.settings, self.keeper, self.shared));
+        listening::serve(self.listeners, clients, door).await;
+    }
+}
+
+impl Lines {
+    /// Other lines that show the same.
+    #[must_use]
+    pub fn new(settings: &[RtuSettings], shared: Current<Shared>) -> Self {
+        Self { settings: settings.to_vec(), shared }
+    }
+
+    /// Answers until `stop`.
+    pub async fn run(self, stop: CancellationToken) {
+        let run = |line| rtu::line::run(line, self.shared.clone(), stop.clone());
+        let lines: JoinSet<()> = self.settings.into_iter().map(run).collect();
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = watch(lines) => {}
         }
     }
 }
 
-/// The connections that are open.
-struct Clients {
-    slots: Slots<CancellationToken>,
-    tasks: JoinSet<(SlotId, End)>,
-    shared: Arc<Shared>,
-    stop: CancellationToken,
+/// Waits for ever; a panic of a line is a bug of ours, and is passed on.
+async fn watch(lines: JoinSet<()>) {
+    lines.join_all().await;
+    std::future::pending::<()>().await;
 }
 
-impl Clients {
-    /// Once a second: the heartbeat registers.
-    fn tick(&self) {
-        let Shared { bank, reader, clock, .. } = &*self.shared;
-        let now = clock.now();
-        reader.read(|image| bank.tick(image, now));
-    }
-
-    /// Serves a newcomer; somebody else makes room if need be.
-    async fn admit(&mut self, stream: TcpStream, peer: SocketAddr) {
-        while let Some(ended) = self.tasks.try_join_next() {
-            self.ended(ended);
-        }
-        if let Err(error) = configure(&stream) {
-            tracing::debug!(%peer, %error, "Modbus connection was gone before it was served");
-            return;
-        }
-        let evict = CancellationToken::new();
-        let taken = self.slots.take(peer.ip(), evict.clone());
-        if let Some(other) = taken.evicted {
-            self.make_room(&other, self.slots.in_use()).await;
-        }
-        self.shared.counters.accepted(self.slots.in_use());
-        tracing::debug!(%peer, "Modbus connection opened");
-        let (shared, stops) = (Arc::clone(&self.shared), Stops { evict, stop: self.stop.clone() });
-        self.tasks.spawn(async move {
-            let end = connection::serve(stream, peer, &shared, &taken.activity, &stops).await;
-            tracing::debug!(%peer, end = end.word(), "Modbus connection ended");
-            (taken.id, end)
-        });
-    }
-
-    /// No file descriptor is left for a client that waits outside: one of those inside ends.
-    async fn give_way(&mut self) {
-        if let Some(other) = self.slots.evict() {
-            self.make_room(&other, self.slots.in_use() + 1).await;
-        }
-    }
-
-    /// Ends a connection and waits until there are fewer than `places`: so there are never more tasks than places.
-    async fn make_room(&mut self, other: &CancellationToken, places: usize) {
-        if self.shared.counters.values().ended(End::Evicted) == 0 {
-            tracing::warn!(
-                open = places,
-                "no room for another Modbus connection: one that never asked, or has been silent for longest, ends (told \
-                 once; raise `max_connections` in [modbus], or the limit of open files, if all of them are wanted)"
-            );
-        }
-        other.cancel();
-        while self.tasks.len() >= places {
-            let Some(ended) = self.tasks.join_next().await else { break };
-            self.ended(ended);
-        }
-    }
-
-    fn ended(&mut self, ended: Result<(SlotId, End), JoinError>) {
-        match ended {
-            Ok((id, end)) => {
-                self.slots.release(id);
-                self.shared.counters.ended(end);
-                self.shared.counters.set_open(self.slots.in_use());
-            }
-            // A panic is our bug; it ends the server as it would in this task, and the supervisor tells.
-            Err(error) => {
-                if let Ok(panic) = error.try_into_panic() {
-                    std::panic::resume_unwind(panic);
-                }
-            }
-        }
-    }
-}
-
-/// Small answers leave at once; a client that vanished is noticed after 25 s and not after two hours.
-fn configure(stream: &TcpStream) -> io::Result<()> {
-    stream.set_nodelay(true)?;
-    setsockopt(stream, sockopt::KeepAlive, &true)?;
-    setsockopt(stream, sockopt::TcpKeepIdle, &10)?;
-    setsockopt(stream, sockopt::TcpKeepInterval, &5)?;
-    setsockopt(stream, sockopt::TcpKeepCount, &3)?;
-    setsockopt(stream, sockopt::TcpUserTimeout, &25_000)?;
-    Ok(())
-}
-
-/// Where connections come from.
-trait Accept: Send + 'static {
-    fn accept(&mut self) -> impl Future<Output = io::Result<(TcpStream, SocketAddr)>> + Send;
-}
-
-impl Accept for TcpListener {
-    async fn accept(&mut self) -> io::Result<(TcpStream, SocketAddr)> {
-        Self::accept(self).await
-    }
-}
-
-/// What an acceptor tells.
-#[derive(Debug)]
-enum Arrival {
-    /// A client.
-    Client(TcpStream, SocketAddr),
-    /// A client waits, but the process or the system has no file descriptor for it.
-    NoDescriptor,
-}
-
-/// Accepts for ever. A failed accept is counted and tried again after a pause; where file descriptors have run out, an open
-/// connection is asked to give way.
-async fn accept(mut listener: impl Accept, accepted: mpsc::Sender<Arrival>, counters: Arc<Counters>) {
-    let mut pause = ACCEPT_PAUSE;
+/// Once a second, for ever: the heartbeat registers.
+async fn beat(current: &Current<Shared>) {
+    let mut second = tokio::time::interval(Duration::from_secs(1));
+    second.set_missed_tick_behavior(MissedTickBehavior::Skip);
     loop {
-        match listener.accept().await {
-            Ok((stream, peer)) => {
-                pause = ACCEPT_PAUSE;
-                if accepted.send(Arrival::Client(stream, peer)).await.is_err() {
-                    return;
-                }
-            }
-            Err(error) => {
-                counters.accept_error();
-                if pause == ACCEPT_PAUSE {
-                    tracing::warn!(%error, "cannot accept Modbus connections for now");
-                }
-                let code = error.raw_os_error().map(nix::errno::Errno::from_raw);
-                if matches!(code, Some(nix::errno::Errno::EMFILE | nix::errno::Errno::ENFILE)) {
-                    // Where this queue is full, clients are being let in, and descriptors come free by that.
-                    let _ = accepted.try_send(Arrival::NoDescriptor);
-                }
-                tokio::time::sleep(pause).await;
-                pause = (pause * 2).min(LONGEST_ACCEPT_PAUSE);
-            }
-        }
+        second.tick().await;
+        let shared = current.get();
+        let now = shared.clock.now();
+        shared.reader.read(|image| shared.bank.tick(image, now));
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use tokio::io::AsyncReadExt;
-
-    use super::*;
-
-    struct OutOfDescriptors {
-        failures: usize,
-        listener: TcpListener,
-    }
-
-    impl Accept for OutOfDescriptors {
-        async fn accept(&mut self) -> io::Result<(TcpStream, SocketAddr)> {
-            if self.failures > 0 {
-                self.failures -= 1;
-                return Err(io::Error::from(nix::errno::Errno::EMFILE));
-            }
-            TcpListener::accept(&self.listener).await
+impl Shared {
+    /// From settings and what they show, with counters that begin at zero; nothing is written, and FC 43/13 is not offered.
+    #[must_use]
+    pub fn new(
+        settings: &ModbusSettings,
+        bank: Arc<RegisterBank>,
+        reader: ImageReader,
+        clock: Clock,
+    ) -> Self {
+        Self {
+            bank,
+            reader,
+            clock,
+            counters: Arc::default(),
+            accounts: Arc::new(Accounts::new(settings.reserved.clone())),
+            rate: settings.rate(),
+            idle_timeout: settings.idle_timeout(),
+            partial_frame_timeout: settings.partial_frame_timeout(),
+            send_timeout: settings.send_timeout(),
+            objects: None,
+            writers: None,
         }
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn accepting_goes_on_after_the_file_descriptors_ran_out() {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let address = listener.local_addr().unwrap();
-        let _client = std::net::TcpStream::connect(address).unwrap();
-        let (sender, mut accepted) = mpsc::channel(1);
-        let counters = Arc::new(Counters::default());
-        let acceptor = OutOfDescriptors { failures: 20, listener };
-        let accepting = tokio::spawn(accept(acceptor, sender, Arc::clone(&counters)));
-        assert!(matches!(accepted.recv().await, Some(Arrival::NoDescriptor)), "somebody has to give way");
-        while !matches!(accepted.recv().await, Some(Arrival::Client(..))) {}
-        assert_eq!(counters.values().accept_errors, 20);
-        drop(accepted);
-        accepting.abort();
+    /// Hands writes in at this desk, and asks for objects of nodes, as far as the settings allow it.
+    #[must_use]
+    pub fn with_desk(self, access: ObjectAccess, desk: Desk) -> Self {
+        let writers = match &self.writers {
+            Some(writers) => writers.at(desk.clone()),
+            None => Writers::new(desk.clone()),
+        };
+        let objects = match access {
+            ObjectAccess::Off => None,
+            ObjectAccess::Read => Some(Objects { desk, write: false }),
+            ObjectAccess::Write => Some(Objects { desk, write: true }),
+        };
+        Self { objects, writers: Some(writers), ..self }
     }
 
-    fn clients(places: usize) -> Clients {
-        Clients {
-            slots: Slots::new(places),
-            tasks: JoinSet::new(),
-            shared: Arc::new(connection::tests::shared()),
-            stop: CancellationToken::new(),
-        }
+    /// What is shown from now on by other settings, registers and values; counters and command blocks go on.
+    #[must_use]
+    pub fn renewed(
+        &self,
+        settings: &ModbusSettings,
+        bank: Arc<RegisterBank>,
+        reader: ImageReader,
+        desk: Desk,
+    ) -> Self {
+        self.accounts.set_reserved(settings.reserved.clone());
+        let (counters, accounts) = (Arc::clone(&self.counters), Arc::clone(&self.accounts));
+        let writers = self.writers.clone();
+        Self { counters, accounts, writers, ..Self::new(settings, bank, reader, self.clock) }
+            .with_desk(settings.canopen_objects, desk)
+    }
+}
+
+impl Service for Current<Shared> {
+    async fn serve(&self, stream: TcpStream, peer: SocketAddr, place: Place) -> &'static str {
+        let counters = Arc::clone(&self.get().counters);
+        counters.accepted();
+        let end = connection::serve(stream, peer, self, &place).await;
+        counters.ended(end);
+        end.word()
     }
 
-    #[tokio::test]
-    async fn without_a_file_descriptor_one_client_gives_way_and_the_others_stay() {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let mut clients = clients(8);
-        clients.give_way().await;
-        let mut near = Vec::new();
-        for _ in 0..3 {
-            near.push(TcpStream::connect(listener.local_addr().unwrap()).await.unwrap());
-            let (stream, peer) = listener.accept().await.unwrap();
-            clients.admit(stream, peer).await;
-        }
-        clients.give_way().await;
-        assert_eq!((clients.slots.in_use(), clients.tasks.len()), (2, 2));
-        let mut byte = [0];
-        assert_eq!(near[0].read(&mut byte).await.unwrap(), 0, "the oldest of those that never asked");
-        assert_eq!(clients.shared.counters.values().ended(End::Evicted), 1);
-        clients.stop.cancel();
+    fn accept_failed(&self) {
+        self.get().counters.accept_error();
     }
 
-    #[tokio::test]
-    async fn f46_a_taken_port_is_named_with_a_hint() {
-        let taken = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let address = taken.local_addr().unwrap();
-        let source = TcpListener::bind(address).await.unwrap_err();
-        let message = BindError { address, source }.to_string();
-        assert!(message.contains(&address.to_string()) && message.contains("another program"), "{message}");
+    fn turned_away(&self, peer: SocketAddr) {
+        let shared = self.get();
+        shared.counters.turned_away();
+        shared.accounts.refused(peer.ip());
     }
 }

@@ -8,6 +8,10 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::rtu::RtuSettings;
+use super::security::SecuritySettings;
+use crate::slots::{AllowList, Limits, Network, Rate};
+
 /// The `[modbus]` table.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -24,6 +28,21 @@ pub struct ModbusSettings {
     /// silent for longest.
     #[schemars(range(min = 1, max = 1024))]
     pub max_connections: u16,
+    /// Connections of one address at the same time, 1..=1024; beyond it the one of its own that was silent for longest ends.
+    /// 0 = as many as there are.
+    #[schemars(range(min = 0, max = 1024))]
+    pub max_connections_per_client: u16,
+    /// Addresses and networks of clients that may come at all; an empty list lets everybody in.
+    #[serde(skip_serializing_if = "AllowList::is_open")]
+    pub allow: AllowList,
+    /// Addresses and networks of the PLCs that always find a place, whether or not they are in `allow`: another client, the one that
+    /// was silent for longest, ends for them, and they for nobody but one another.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub reserved: Vec<Network>,
+    /// Requests a second that one connection may make, as many at once; further ones wait for their answer. 0 = no limit. Clients of
+    /// `reserved` have none.
+    #[schemars(range(max = 10000))]
+    pub max_requests_per_s: u32,
     /// Close a connection after this many seconds without a request; 0 = never. Dead peers are found by TCP keep-alive
     /// all the same.
     pub idle_timeout_s: u32,
@@ -36,6 +55,12 @@ pub struct ModbusSettings {
     /// FC 43/13, objects of the nodes by SDO: `off`, `read`, or `write` for both. Whoever reaches the port can then read, or
     /// change, every object of every node.
     pub canopen_objects: ObjectAccess,
+    /// Serial lines on which the registers can be read too.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub rtu: Vec<RtuSettings>,
+    /// Modbus/TCP Security: TLS with certificates on both sides, and the client's role in its certificate.
+    #[serde(skip_serializing_if = "SecuritySettings::is_default")]
+    pub security: SecuritySettings,
 }
 
 /// What FC 43/13 may do.
@@ -80,10 +105,16 @@ impl Default for ModbusSettings {
             word_order: WordOrder::Big,
             gateway_unit_id: 247,
             max_connections: 64,
+            max_connections_per_client: 0,
+            allow: AllowList::default(),
+            reserved: Vec::new(),
+            max_requests_per_s: 0,
             idle_timeout_s: 0,
             partial_frame_timeout_ms: 10_000,
             send_timeout_ms: 5_000,
             canopen_objects: ObjectAccess::Off,
+            rtu: Vec::new(),
+            security: SecuritySettings::default(),
         }
     }
 }
@@ -106,9 +137,11 @@ impl ModbusSettings {
     /// Every number that is out of its range.
     #[must_use]
     pub fn problems(&self) -> Vec<SettingsError> {
-        let checks: [(&'static str, u32, RangeInclusive<u32>); 4] = [
+        let checks: [(&'static str, u32, RangeInclusive<u32>); 6] = [
             ("gateway_unit_id", self.gateway_unit_id.into(), 1..=247),
             ("max_connections", self.max_connections.into(), 1..=1024),
+            ("max_connections_per_client", self.max_connections_per_client.into(), 0..=1024),
+            ("max_requests_per_s", self.max_requests_per_s, 0..=10_000),
             ("partial_frame_timeout_ms", self.partial_frame_timeout_ms, 100..=u32::MAX),
             ("send_timeout_ms", self.send_timeout_ms, 100..=u32::MAX),
         ];
@@ -122,6 +155,43 @@ impl ModbusSettings {
                 highest: *range.end(),
             })
             .collect()
+    }
+
+    /// Who may come, and how many at once.
+    #[must_use]
+    pub fn limits(&self) -> Limits {
+        let share = usize::from(self.max_connections_per_client);
+        Limits {
+            places: self.max_connections.into(),
+            allow: self.allow.clone(),
+            reserved: self.reserved.clone(),
+            share: if share == 0 { usize::MAX } else { share },
+        }
+    }
+
+    /// How often one connection may ask; `None`: as often as it likes.
+    #[must_use]
+    pub fn rate(&self) -> Option<Rate> {
+        let each = Duration::from_secs(1).checked_div(self.max_requests_per_s)?;
+        Some(Rate { each, burst: self.max_requests_per_s })
+    }
+
+    /// Whether others than this host can reach the objects of the nodes (FC 43/13), and what they can do then; with a hint.
+    #[must_use]
+    pub fn warning(&self) -> Option<(String, String)> {
+        let listen = self.listen.iter().find(|listen| !listen.ip().is_loopback())?;
+        if !self.allow.is_open() {
+            return None;
+        }
+        let (what, mend) = match self.canopen_objects {
+            ObjectAccess::Off => return None,
+            ObjectAccess::Read => ("read every object", "with \"off\" only registers are read"),
+            ObjectAccess::Write => ("read and change every device", "with \"read\" nothing can be changed"),
+        };
+        Some((
+            format!("whoever reaches {listen} can {what} by FC 43/13 without a login"),
+            format!("name the clients in `allow`, or listen on 127.0.0.1; {mend}"),
+        ))
     }
 
     /// How long a connection may be silent; `None` = for ever.
@@ -160,6 +230,22 @@ mod tests {
         let settings: ModbusSettings = toml::from_str("word_order = \"little\"").unwrap();
         assert_eq!(settings.word_order.letters(), "CDAB");
         assert!(toml::from_str::<ModbusSettings>("word_order = \"CDAB\"").is_err());
+    }
+
+    #[test]
+    fn objects_that_other_hosts_reach_are_warned_of_with_what_can_be_done_to_them() {
+        let warning = |text: &str| toml::from_str::<ModbusSettings>(text).unwrap().warning();
+        assert_eq!(warning("listen = ['0.0.0.0:5020']"), None, "registers are there to be read");
+        assert_eq!(warning("canopen_objects = 'write'"), None, "only this host reaches it");
+        assert_eq!(warning("listen = []\ncanopen_objects = 'write'"), None);
+        let named = "listen = ['0.0.0.0:502']\nallow = ['10.0.0.5']\ncanopen_objects = 'write'";
+        assert_eq!(warning(named), None);
+        let listen = "listen = ['127.0.0.1:5020', '10.0.0.1:502']\n";
+        let (message, hint) = warning(&format!("{listen}canopen_objects = 'read'")).unwrap();
+        assert!(message.contains("10.0.0.1:502 can read every object"), "{message}");
+        assert!(hint.contains("with \"off\""), "{hint}");
+        let (message, hint) = warning(&format!("{listen}canopen_objects = 'write'")).unwrap();
+        assert!(message.contains("read and change") && hint.contains("with \"read\""), "{message} {hint}");
     }
 
     #[test]

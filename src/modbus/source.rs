@@ -1,6 +1,6 @@
 //! Where a tag's value comes from, in words for the register map.
 
-use crate::mapping::{Derived, EmergencyPart, Field, NodeDef, Source, TagTable};
+use crate::mapping::{Derived, EmergencyPart, Field, FieldKind, ModuleCarrier, NodeDef, Source, TagTable};
 use crate::process_image::TagIndex;
 
 /// `TPDO3 byte 0 bit 1`, `maximum of knock_intensity_1 .. knock_intensity_20`.
@@ -8,7 +8,7 @@ use crate::process_image::TagIndex;
 pub fn source_text(table: &TagTable, node: &NodeDef, source: &Source) -> String {
     match source {
         Source::Pdo { pdo, field, .. } => {
-            let number = node.canopen.pdos.get(*pdo).map_or(0, |pdo| pdo.number);
+            let number = node.pdos().get(*pdo).map_or(0, |pdo| pdo.number);
             format!("TPDO{number} {}", field_text(*field))
         }
         Source::Rpdo { rpdo, field, .. } => {
@@ -16,7 +16,7 @@ pub fn source_text(table: &TagTable, node: &NodeDef, source: &Source) -> String 
             format!("RPDO{number} {}", field_text(*field))
         }
         Source::Polled { poll, .. } => {
-            let object = node.canopen.polls.get(*poll).map(|poll| poll.object);
+            let object = node.protocol.polls().get(*poll).map(|poll| poll.object);
             object.map_or_else(String::new, |object| format!("SDO {object}"))
         }
         Source::Adopted { object, .. } => format!("{object}, where the device maps it"),
@@ -26,7 +26,35 @@ pub fn source_text(table: &TagTable, node: &NodeDef, source: &Source) -> String 
             EmergencyPart::Vendor => "EMCY manufacturer bytes".to_owned(),
             EmergencyPart::ActiveCount => "number of errors".to_owned(),
         },
+        Source::Module { carrier, field, .. } => module_text(node, *carrier, *field),
         Source::Derived(derived) => derived_text(table, derived),
+    }
+}
+
+/// The identifier of the PDO in which it stands, node id added; of an RPDO where the gateway may send it.
+#[must_use]
+pub fn cob_id(node: &NodeDef, source: &Source) -> Option<String> {
+    let id = match source {
+        Source::Pdo { pdo, .. } => node.pdos().get(*pdo)?.cob_id,
+        Source::Rpdo { rpdo, .. } => node.canopen()?.rpdos.get(*rpdo)?.cob_id,
+        Source::Polled { .. }
+        | Source::Adopted { .. }
+        | Source::Emergency { .. }
+        | Source::Module { .. }
+        | Source::Derived(_) => {
+            return None;
+        }
+    };
+    Some(format!("0x{id}"))
+}
+
+/// `CAN status byte bit 0`, `channel 1 bytes received`.
+fn module_text(node: &NodeDef, carrier: usize, field: Field) -> String {
+    let Some(module) = node.protocol.module() else { return String::new() };
+    let Some(value) = ModuleCarrier::at(carrier, module.channels.len()) else { return String::new() };
+    match field.kind {
+        FieldKind::Bool => format!("{} bit {}", value.text(module), field.bit),
+        FieldKind::Unsigned | FieldKind::Signed | FieldKind::Float => value.text(module),
     }
 }
 
@@ -74,7 +102,6 @@ fn derived_text(table: &TagTable, derived: &Derived) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mapping::FieldKind;
 
     fn text(bit: u8, width: u8) -> String {
         field_text(Field { bit, width, kind: FieldKind::Unsigned, big_endian: false, invert: false })

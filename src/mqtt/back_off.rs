@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use super::settings::{BACK_OFF_FIRST, BACK_OFF_LONGEST, HEALTHY_AFTER, REFUSED, SILENCE};
+use super::settings::{BACK_OFF_FIRST, BACK_OFF_LONGEST, HEALTHY_AFTER, MqttSettings, REFUSED, SILENCE};
 
 /// How long to wait for what.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -32,6 +32,14 @@ impl Default for Pace {
             healthy_after: HEALTHY_AFTER,
             silence: SILENCE,
         }
+    }
+}
+
+impl Pace {
+    /// As configured.
+    #[must_use]
+    pub fn of(settings: &MqttSettings) -> Self {
+        Self { longest: Duration::from_secs(settings.reconnect_max_s.into()), ..Self::default() }
     }
 }
 

@@ -1,17 +1,29 @@
 //! What the broker has not acknowledged yet: ordered, bounded, in memory.
 //!
-//! Two lanes take turns, so that what is live never waits behind a backlog of events:
+//! Two lanes take turns, so that what is live never waits behind a backlog of events; a third has what they leave:
 //!
 //! - *latest*: retained topics. Of one topic only the newest message waits; it takes the place of the one before. There
 //!   are only so many topics, so nothing has to leave this lane: what was told to it reaches the broker.
 //! - *events*: every one is kept, in order, within the limits in count and bytes. When they are full, the oldest leaves.
+//!   Those that stand in the store do not count: few of them are taken out at a time.
+//! - *history*: samples from the store. They go when nothing else waits, and never fill more than half of the window.
 //!
 //! A message is forgotten when it is acknowledged, superseded by a newer one of its retained topic, or dropped because
 //! the outbox is full; the last two are counted. When the session is lost, events that were not acknowledged go back in
 //! front, in order, and will be sent again; what is retained is let go, because each session begins with all of it.
+//! Samples that were let go so are given back: they belong to the history.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+
+use crate::store::Class;
+use crate::time::Instant;
+
+mod not_taken;
+mod report;
+
+pub use not_taken::{Became, NotTakenMessage};
+pub use report::OutboxReport;
 
 /// A message for the broker.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -25,19 +37,44 @@ pub struct Message {
     /// The broker keeps it for later subscribers; of those that wait only the newest is kept. What is not retained is an
     /// event.
     pub retain: bool,
+    /// From then on nobody is to get it; with MQTT 5 nobody does.
+    pub expires: Option<Instant>,
+    /// What a request wants to find in its answer, with MQTT 5.
+    pub correlation: Option<Arc<[u8]>>,
 }
 
 impl Message {
+    /// A retained message of quality of service 1 that does not expire.
+    #[must_use]
+    pub fn retained(topic: Arc<str>, payload: Arc<str>) -> Self {
+        Self { retain: true, ..Self::event(topic, payload) }
+    }
+
+    /// An event, of quality of service 1, that does not expire.
+    #[must_use]
+    pub fn event(topic: Arc<str>, payload: Arc<str>) -> Self {
+        Self { topic, payload, at_least_once: true, retain: false, expires: None, correlation: None }
+    }
+
     /// What it takes of the outbox's bytes.
     #[must_use]
     pub fn size(&self) -> usize {
-        self.topic.len().saturating_add(self.payload.len())
+        let correlation = self.correlation.as_ref().map_or(0, |data| data.len());
+        self.topic.len().saturating_add(self.payload.len()).saturating_add(correlation)
     }
 }
 
 /// Names a message between [`Outbox::poll_output`] and [`Outbox::handle_acknowledged`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct MessageId(u64);
+
+impl MessageId {
+    /// Of a message that is in no outbox.
+    #[must_use]
+    pub const fn new(number: u64) -> Self {
+        Self(number)
+    }
+}
 
 /// A message to be sent now.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -63,66 +100,39 @@ pub struct Limits {
     pub message: usize,
 }
 
-/// Fill and counters since the start. Counters saturate.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct OutboxReport {
-    /// Messages in the outbox: events, and at most one waiting for each retained topic.
-    pub messages: usize,
-    /// Most events.
-    pub messages_limit: usize,
-    /// Bytes in the outbox.
-    pub bytes: usize,
-    /// Most bytes of events.
-    pub bytes_limit: usize,
-    /// Events in the outbox, and their bytes: what the limits hold for.
-    pub held: (usize, usize),
-    /// Times that a message was handed to the session.
-    pub sent: u64,
-    /// Of those: after an earlier try whose session ended.
-    pub sent_again: u64,
-    /// Acknowledged by the broker.
-    pub acknowledged: u64,
-    /// Retained messages that were let go without an acknowledgement: a newer one of the same topic replaced them, or the
-    /// session was lost.
-    pub superseded: u64,
-    /// Larger than the limit of one message.
-    pub too_large: u64,
-    /// Events that left the journal before they could be read.
-    pub events_missed: u64,
-    /// Events taken in, and their bytes: for the forecast.
-    pub events: (u64, u64),
-    /// Events dropped because the outbox was full.
-    pub events_dropped: u64,
-}
-
-impl OutboxReport {
-    /// Messages dropped because the outbox was full, by class. Only events can be; the other classes are a promise of
-    /// version 1 of the payloads.
-    #[must_use]
-    pub fn dropped(&self) -> [(&'static str, u64); 4] {
-        [("sample", 0), ("status", 0), ("alarm", 0), ("event", self.events_dropped)]
-    }
-
-    /// How long events at their mean rate so far would take to fill what is free; `None` before the first event.
-    /// At most 10,000 hours.
-    #[must_use]
-    #[expect(clippy::as_conversions, clippy::cast_precision_loss, reason = "a forecast needs no 53 bits")]
-    pub fn hours_left(&self, uptime_s: u64) -> Option<f64> {
-        let (events, bytes) = self.events;
-        let hours = uptime_s.max(1) as f64 / 3600.0;
-        let left = |free: usize, used: u64| free as f64 / (used as f64 / hours);
-        let by_count = left(self.messages_limit.saturating_sub(self.held.0), events);
-        let by_bytes = left(self.bytes_limit.saturating_sub(self.held.1), bytes);
-        (events > 0).then(|| by_count.min(by_bytes).min(10_000.0))
-    }
-}
-
 #[derive(Clone, Debug)]
 struct Entry {
     message: Message,
+    origin: Origin,
     /// Sent in an earlier session.
     sent_before: bool,
 }
+
+/// Where a message comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Origin {
+    /// It is here and nowhere else.
+    Here,
+    /// A sample that is told live since then, and whether it went to the store meanwhile.
+    Sample(Instant, Copied),
+    /// It stands in the store, at this position.
+    Stored(Class, u64),
+    /// It stands in the store, nobody knows where, and comes again.
+    Forgotten,
+}
+
+/// Whether a sample that is told live is in the store too.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Copied {
+    No,
+    /// It is on its way there.
+    Soon,
+    /// At this position.
+    At(u64),
+}
+
+/// A sample that is not told live any more, and that the store does not have.
+pub type Unsent = Message;
 
 /// The outbox.
 #[derive(Clone, Debug)]
@@ -134,11 +144,19 @@ pub struct Outbox {
     latest_of: BTreeMap<Arc<str>, MessageId>,
     /// Events that wait, oldest first.
     events: BTreeMap<MessageId, Entry>,
+    /// How many of them are of the store.
+    stored_events: usize,
+    /// Samples of the store that wait, oldest first.
+    history: BTreeMap<MessageId, Entry>,
+    /// Samples that were acknowledged before the store said where it has them.
+    acknowledged_soon: BTreeSet<MessageId>,
     /// Sent, not acknowledged.
     in_flight: BTreeMap<MessageId, Entry>,
     next: u64,
     /// The lane whose turn it is.
     latest_turn: bool,
+    /// The broker does not take events for now: only what is retained is sent.
+    held: bool,
     report: OutboxReport,
 }
 
@@ -156,9 +174,13 @@ impl Outbox {
             latest: BTreeMap::new(),
             latest_of: BTreeMap::new(),
             events: BTreeMap::new(),
+            stored_events: 0,
+            history: BTreeMap::new(),
+            acknowledged_soon: BTreeSet::new(),
             in_flight: BTreeMap::new(),
             next: 0,
             latest_turn: true,
+            held: false,
             report,
         }
     }
@@ -175,19 +197,63 @@ impl Outbox {
             let size = u64::try_from(message.size()).unwrap_or(u64::MAX);
             self.report.events = (events.saturating_add(1), bytes.saturating_add(size));
         }
-        let superseded = if message.retain { self.latest_of.get(&message.topic).copied() } else { None };
-        let id = superseded.unwrap_or_else(|| self.next_id());
-        if superseded.is_some() {
-            self.remove_waiting(id);
-            count(&mut self.report.superseded);
-        }
-        self.insert_waiting(id, Entry { message, sent_before: false });
+        let (id, _) = self.take_in(message, Origin::Here);
         while self.report.held.0 > self.limits.messages || self.report.held.1 > self.limits.bytes {
-            let Some(oldest) = self.events.keys().next().copied() else { break };
+            let oldest = self.events.iter().find(|(_, entry)| entry.origin == Origin::Here);
+            let Some(oldest) = oldest.map(|(id, _)| *id) else { break };
             self.remove_waiting(oldest);
             count(&mut self.report.events_dropped);
         }
         Some(id)
+    }
+
+    /// Takes a sample in that is to be told live, on a retained topic; gives the one that waited there and that the store
+    /// does not have.
+    pub fn push_sample(&mut self, message: Message, now: Instant) -> Option<Unsent> {
+        if message.size() > self.limits.message {
+            count(&mut self.report.too_large);
+            return None;
+        }
+        let (_, superseded) = self.take_in(message, Origin::Sample(now, Copied::No));
+        superseded.and_then(Entry::unsent)
+    }
+
+    /// Whether a message of a retained topic waits to be sent.
+    #[must_use]
+    pub fn is_waiting(&self, topic: &str) -> bool {
+        self.latest_of.contains_key(topic)
+    }
+
+    /// Takes a message out of the store in, which keeps it until it is acknowledged. `false` for one that no broker would
+    /// take: it is acknowledged with that.
+    pub fn push_stored(&mut self, message: Message, class: Class, position: u64) -> bool {
+        let fits = message.size() <= self.limits.message;
+        if fits {
+            self.take_in(message, Origin::Stored(class, position));
+        } else {
+            count(&mut self.report.too_large);
+        }
+        fits
+    }
+
+    fn take_in(&mut self, message: Message, origin: Origin) -> (MessageId, Option<Entry>) {
+        let before = if message.retain { self.latest_of.get(&message.topic).copied() } else { None };
+        let superseded = before.and_then(|id| self.remove_waiting(id));
+        if superseded.is_some() {
+            count(&mut self.report.superseded);
+        }
+        // What waits takes the place of the one before; a sample that is on its way to the store keeps its own name.
+        let is_on_its_way = superseded.as_ref().is_some_and(|entry| entry.is_copied(Copied::Soon));
+        let id = before.filter(|_| !is_on_its_way).unwrap_or_else(|| self.next_id());
+        self.insert_waiting(id, Entry { message, origin, sent_before: false });
+        (id, superseded)
+    }
+
+    /// Takes the place of another one: all that is in it, and its counters. The limits are its own, in the report too.
+    pub fn go_on_from(&mut self, old: Self) {
+        let Limits { messages: messages_limit, bytes: bytes_limit, .. } = self.limits;
+        let report = OutboxReport { messages_limit, bytes_limit, ..old.report };
+        *self = Self { limits: self.limits, report, ..old };
     }
 
     /// The next message to send, while the window is open.
@@ -195,8 +261,16 @@ impl Outbox {
         if self.in_flight.len() >= self.limits.window {
             return None;
         }
-        let from_latest = (self.latest_turn || self.events.is_empty()) && !self.latest.is_empty();
-        let lane = if from_latest { &self.latest } else { &self.events };
+        if self.held && self.latest.is_empty() {
+            return None;
+        }
+        let no_events = self.held || self.events.is_empty();
+        let from_latest = (self.latest_turn || no_events) && !self.latest.is_empty();
+        let lane = match (from_latest, no_events, self.may_send_history()) {
+            (true, _, _) => &self.latest,
+            (false, true, true) => &self.history,
+            (false, _, _) => &self.events,
+        };
         let id = *lane.keys().next()?;
         self.latest_turn = !from_latest;
         let entry = self.remove_waiting(id)?;
@@ -210,34 +284,115 @@ impl Outbox {
         Some(outgoing)
     }
 
-    /// The broker has it: forgotten. An id that is not in flight is ignored.
-    pub fn handle_acknowledged(&mut self, id: MessageId) {
-        if let Some(entry) = self.in_flight.remove(&id) {
-            self.count_out(&entry);
-            count(&mut self.report.acknowledged);
+    /// The broker has it: forgotten. An id that is not in flight is ignored. Gives where the store has it.
+    pub fn handle_acknowledged(&mut self, id: MessageId) -> Option<(Class, u64)> {
+        let entry = self.in_flight.remove(&id)?;
+        self.count_out(&entry);
+        count(&mut self.report.acknowledged);
+        if entry.is_copied(Copied::Soon) {
+            self.acknowledged_soon.insert(id);
         }
+        entry.stored()
     }
 
-    /// The session ended: events in flight go back in front, in order; what is retained is let go.
-    pub fn handle_session_down(&mut self) {
+    /// The session ended: events and history in flight go back in front, in order; what is retained is let go. Gives the
+    /// samples among that, in order.
+    pub fn handle_session_down(&mut self) -> Vec<Unsent> {
+        self.held = false;
+        let mut samples = BTreeMap::new();
         for (id, entry) in std::mem::take(&mut self.in_flight) {
             self.count_out(&entry);
             if entry.message.retain {
                 count(&mut self.report.superseded);
-            } else {
+                samples.insert(id, entry);
+            } else if entry.origin != Origin::Forgotten {
                 self.insert_waiting(id, Entry { sent_before: true, ..entry });
             }
         }
-        self.let_go_of_latest();
+        samples.extend(self.let_go_of_latest());
+        samples.into_values().filter_map(Entry::unsent).collect()
     }
 
-    /// Nothing that waits will be sent any more; what is in flight may still be acknowledged.
-    pub fn clear_waiting(&mut self) {
-        self.let_go_of_latest();
-        while let Some(id) = self.events.keys().next().copied() {
-            self.remove_waiting(id);
-            count(&mut self.report.events_dropped);
+    /// The samples that are told live since `since` or longer and that the store does not have: they are on their way there
+    /// now. Their names are for [`handle_stored`](Self::handle_stored).
+    pub fn take_overdue(&mut self, since: Instant) -> Vec<(MessageId, Message)> {
+        let mut overdue = Vec::new();
+        for (id, entry) in self.in_flight.iter_mut().chain(&mut self.latest) {
+            if let Origin::Sample(told, copied @ Copied::No) = &mut entry.origin
+                && *told <= since
+            {
+                *copied = Copied::Soon;
+                overdue.push((*id, entry.message.clone()));
+            }
         }
+        overdue
+    }
+
+    /// Since when the oldest sample is told live that the store does not have.
+    #[must_use]
+    pub fn oldest_sample(&self) -> Option<Instant> {
+        let told = |entry: &Entry| match entry.origin {
+            Origin::Sample(told, Copied::No) => Some(told),
+            Origin::Sample(..) | Origin::Here | Origin::Stored(..) | Origin::Forgotten => None,
+        };
+        self.in_flight.values().chain(self.latest.values()).filter_map(told).min()
+    }
+
+    /// The store has a sample there. `false` when it need not keep it: the broker has it.
+    pub fn handle_stored(&mut self, id: MessageId, position: u64) -> bool {
+        if self.acknowledged_soon.remove(&id) {
+            return false;
+        }
+        let entry = self.in_flight.get_mut(&id).or_else(|| self.latest.get_mut(&id));
+        if let Some(Entry { origin: Origin::Sample(_, copied @ Copied::Soon), .. }) = entry {
+            *copied = Copied::At(position);
+        }
+        true
+    }
+
+    /// The first position among the samples of the store that are still told live: the history must not go further.
+    #[must_use]
+    pub fn first_told_live(&self) -> Option<u64> {
+        let position = |entry: &Entry| match entry.origin {
+            Origin::Sample(_, Copied::At(position)) => Some(position),
+            Origin::Sample(..) | Origin::Here | Origin::Stored(..) | Origin::Forgotten => None,
+        };
+        self.in_flight.values().chain(self.latest.values()).filter_map(position).min()
+    }
+
+    /// Messages of the store that wait, of a class.
+    #[must_use]
+    pub fn stored_waiting(&self, class: Class) -> usize {
+        match class {
+            Class::Sample => self.history.len(),
+            Class::Event => self.stored_events,
+        }
+    }
+
+    /// Positions in the store are others now: all that came out of it is forgotten, and will come again.
+    pub fn forget_stored(&mut self) {
+        let is_stored = |(id, entry): (&MessageId, &Entry)| entry.stored().is_some().then_some(*id);
+        let waiting: Vec<_> = self.events.iter().chain(&self.history).filter_map(is_stored).collect();
+        for id in waiting {
+            self.remove_waiting(id);
+        }
+        for entry in self.in_flight.values_mut().chain(self.latest.values_mut()) {
+            if entry.stored().is_some() {
+                entry.origin = Origin::Forgotten;
+            }
+        }
+    }
+
+    /// Nothing that waits will be sent any more; what is in flight may still be acknowledged. What the store has is not
+    /// lost with that. Gives the samples that it does not have.
+    pub fn clear_waiting(&mut self) -> Vec<Unsent> {
+        let samples = self.let_go_of_latest();
+        while let Some(id) = self.events.keys().chain(self.history.keys()).next().copied() {
+            if self.remove_waiting(id).is_some_and(|entry| entry.stored().is_none()) {
+                count(&mut self.report.events_dropped);
+            }
+        }
+        samples.into_values().filter_map(Entry::unsent).collect()
     }
 
     /// Counts events that never came in.
@@ -268,11 +423,19 @@ impl Outbox {
         MessageId(self.next)
     }
 
-    fn let_go_of_latest(&mut self) {
+    fn may_send_history(&self) -> bool {
+        let is_history = |entry: &&Entry| matches!(entry.origin, Origin::Stored(Class::Sample, _));
+        let in_flight = self.in_flight.values().filter(is_history).count();
+        !self.history.is_empty() && in_flight < (self.limits.window / 2).max(1)
+    }
+
+    fn let_go_of_latest(&mut self) -> BTreeMap<MessageId, Entry> {
+        let mut gone = BTreeMap::new();
         while let Some(id) = self.latest.keys().next().copied() {
-            self.remove_waiting(id);
+            gone.extend(self.remove_waiting(id).map(|entry| (id, entry)));
             count(&mut self.report.superseded);
         }
+        gone
     }
 
     fn insert_waiting(&mut self, id: MessageId, entry: Entry) {
@@ -280,13 +443,21 @@ impl Outbox {
         if entry.message.retain {
             self.latest_of.insert(Arc::clone(&entry.message.topic), id);
             self.latest.insert(id, entry);
+        } else if matches!(entry.origin, Origin::Stored(Class::Sample, _)) {
+            self.history.insert(id, entry);
         } else {
+            self.stored_events += usize::from(entry.stored().is_some());
             self.events.insert(id, entry);
         }
     }
 
     fn remove_waiting(&mut self, id: MessageId) -> Option<Entry> {
-        let entry = self.latest.remove(&id).or_else(|| self.events.remove(&id))?;
+        let found = self.latest.remove(&id).or_else(|| {
+            let event = self.events.remove(&id)?;
+            self.stored_events -= usize::from(event.stored().is_some());
+            Some(event)
+        });
+        let entry = found.or_else(|| self.history.remove(&id))?;
         if entry.message.retain {
             self.latest_of.remove(&entry.message.topic);
         }
@@ -298,7 +469,7 @@ impl Outbox {
         let size = entry.message.size();
         self.report.messages += 1;
         self.report.bytes += size;
-        if !entry.message.retain {
+        if entry.counts() {
             self.report.held = (self.report.held.0 + 1, self.report.held.1 + size);
         }
     }
@@ -307,9 +478,34 @@ impl Outbox {
         let size = entry.message.size();
         self.report.messages -= 1;
         self.report.bytes -= size;
-        if !entry.message.retain {
+        if entry.counts() {
             self.report.held = (self.report.held.0 - 1, self.report.held.1 - size);
         }
+    }
+}
+
+impl Entry {
+    /// Whether the limits hold for it.
+    fn counts(&self) -> bool {
+        !self.message.retain && self.origin == Origin::Here
+    }
+
+    fn is_copied(&self, copied: Copied) -> bool {
+        matches!(self.origin, Origin::Sample(_, is) if is == copied)
+    }
+
+    /// Where the store has it.
+    fn stored(&self) -> Option<(Class, u64)> {
+        match self.origin {
+            Origin::Stored(class, position) => Some((class, position)),
+            Origin::Sample(_, Copied::At(position)) => Some((Class::Sample, position)),
+            Origin::Sample(..) | Origin::Here | Origin::Forgotten => None,
+        }
+    }
+
+    /// The message, where it is a sample that the store does not have.
+    fn unsent(self) -> Option<Unsent> {
+        self.is_copied(Copied::No).then_some(self.message)
     }
 }
 
@@ -318,196 +514,5 @@ fn count(counter: &mut u64) {
 }
 
 #[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    fn message(topic: &str, payload: &str, retain: bool) -> Message {
-        Message { topic: topic.into(), payload: payload.into(), at_least_once: true, retain }
-    }
-
-    fn outbox(messages: usize, window: usize) -> Outbox {
-        Outbox::new(Limits { messages, bytes: 1_000_000, window, message: 1000 })
-    }
-
-    fn drain(outbox: &mut Outbox) -> Vec<String> {
-        std::iter::from_fn(|| outbox.poll_output()).map(|out| out.message.payload.to_string()).collect()
-    }
-
-    #[test]
-    fn of_a_retained_topic_only_the_newest_waits_at_its_place() {
-        let mut outbox = outbox(10, 10);
-        outbox.push(message("a", "a1", true));
-        outbox.push(message("b", "b1", true));
-        outbox.push(message("a", "a2", true));
-        assert_eq!(drain(&mut outbox), ["a2", "b1"]);
-        assert_eq!(outbox.report().superseded, 1);
-        outbox.push(message("a", "a3", true));
-        assert_eq!(drain(&mut outbox), ["a3"], "what is sent already is not superseded");
-    }
-
-    #[test]
-    fn a_full_outbox_lets_the_oldest_events_go_and_nothing_that_is_retained() {
-        let mut outbox = outbox(4, 0);
-        outbox.push(message("state", "s", true));
-        outbox.push(message("alarm", "a", true));
-        for number in 1..=6 {
-            outbox.push(message("event", &format!("e{number}"), false));
-        }
-        outbox.push(message("health", "h", true));
-        assert_eq!(outbox.report().events_dropped, 2);
-        outbox.limits.window = 10;
-        assert_eq!(drain(&mut outbox), ["s", "e3", "a", "e4", "h", "e5", "e6"]);
-    }
-
-    #[test]
-    fn what_waits_at_a_stop_is_let_go_and_counted_what_is_sent_may_still_be_acknowledged() {
-        let mut outbox = outbox(10, 1);
-        for (topic, retain) in [("event", false), ("event", false), ("state", true)] {
-            outbox.push(message(topic, "x", retain));
-        }
-        let sent = outbox.poll_output().unwrap();
-        outbox.clear_waiting();
-        assert_eq!((outbox.report().messages, outbox.report().held.0), (1, 0));
-        assert_eq!(outbox.report().events_dropped, 2);
-        outbox.handle_acknowledged(sent.id);
-        assert!(outbox.is_empty());
-    }
-
-    #[test]
-    fn p5_after_a_lost_session_events_come_again_in_order_and_are_marked() {
-        let mut outbox = outbox(10, 3);
-        for number in 1..=4 {
-            outbox.push(message("event", &format!("e{number}"), false));
-        }
-        let sent: Vec<_> = std::iter::from_fn(|| outbox.poll_output()).collect();
-        assert!(sent.iter().all(|out| !out.again));
-        outbox.handle_acknowledged(sent[1].id);
-        outbox.handle_session_down();
-        outbox.limits.window = 10;
-        let again: Vec<_> = std::iter::from_fn(|| outbox.poll_output())
-            .map(|out| (out.message.payload.to_string(), out.again))
-            .collect();
-        let expected =
-            [("e1", true), ("e3", true), ("e4", false)].map(|(name, again)| (name.to_owned(), again));
-        assert_eq!(again, expected);
-    }
-
-    #[test]
-    fn p6_what_is_live_takes_turns_with_the_backlog() {
-        let mut outbox = outbox(100, 100);
-        for number in 1..=3 {
-            outbox.push(message("event", &format!("e{number}"), false));
-        }
-        outbox.push(message("a", "live1", true));
-        outbox.push(message("b", "live2", true));
-        assert_eq!(drain(&mut outbox), ["live1", "e1", "live2", "e2", "e3"]);
-    }
-
-    #[test]
-    fn a_message_that_no_broker_takes_is_counted_and_thrown_away() {
-        let mut outbox = outbox(10, 10);
-        outbox.push(message("event", &"x".repeat(2000), false));
-        assert!(outbox.is_empty());
-        assert_eq!(outbox.report().too_large, 1);
-    }
-
-    #[test]
-    fn the_forecast_is_what_is_free_over_the_mean_rate() {
-        let mut outbox = outbox(110, 0);
-        assert_eq!(outbox.report().hours_left(3600), None);
-        for _ in 0..10 {
-            outbox.push(message("event", "x", false));
-        }
-        assert_eq!(outbox.report().hours_left(3600), Some(10.0));
-    }
-
-    #[derive(Clone, Debug)]
-    enum Step {
-        Push { topic: usize, size: usize },
-        Send,
-        Acknowledge { which: usize },
-        SessionDown,
-    }
-
-    fn step() -> impl Strategy<Value = Step> {
-        prop_oneof![
-            6 => (0usize..6, 1usize..40).prop_map(|(topic, size)| Step::Push { topic, size }),
-            6 => Just(Step::Send),
-            4 => (0usize..4).prop_map(|which| Step::Acknowledge { which }),
-            1 => Just(Step::SessionDown),
-        ]
-    }
-
-    /// Topics 0 and 1 are events, the others retained.
-    fn is_retained(topic: usize) -> bool {
-        topic >= 2
-    }
-
-    proptest! {
-        #[test]
-        fn p1_p5_p6_nothing_is_lost_uncounted_reordered_or_doubled_within_a_session(
-            steps in proptest::collection::vec(step(), 1..300),
-            messages in 1usize..12,
-            window in 1usize..5,
-        ) {
-            let mut outbox = Outbox::new(Limits { messages, bytes: 250, window, message: 35 });
-            let mut pushed = 0u64;
-            // Sequence number -> session in which it was sent last.
-            let mut sent: BTreeMap<u64, u64> = BTreeMap::new();
-            // Highest sequence number sent first, of each topic.
-            let mut newest: BTreeMap<String, u64> = BTreeMap::new();
-            let mut in_flight: Vec<MessageId> = Vec::new();
-            let mut session = 0u64;
-            for step in steps {
-                match step {
-                    Step::Push { topic, size } => {
-                        pushed += 1;
-                        let payload = format!("{pushed:0size$}");
-                        outbox.push(message(&topic.to_string(), &payload, is_retained(topic)));
-                    }
-                    Step::Send => {
-                        if let Some(out) = outbox.poll_output() {
-                            let seq: u64 = out.message.payload.parse().unwrap();
-                            let before = sent.insert(seq, session);
-                            prop_assert_eq!(before.is_some(), out.again);
-                            prop_assert!(before.is_none_or(|before| before < session), "twice in a session");
-                            let newest = newest.entry(out.message.topic.to_string()).or_default();
-                            prop_assert!(out.again || seq > *newest, "first deliveries in order");
-                            *newest = seq.max(*newest);
-                            in_flight.push(out.id);
-                            prop_assert!(in_flight.len() <= window);
-                        }
-                    }
-                    Step::Acknowledge { which } => {
-                        if which < in_flight.len() {
-                            outbox.handle_acknowledged(in_flight.remove(which));
-                        }
-                    }
-                    Step::SessionDown => {
-                        session += 1;
-                        in_flight.clear();
-                        outbox.handle_session_down();
-                    }
-                }
-                let report = *outbox.report();
-                let waiting = outbox.events.len() + outbox.latest.len();
-                prop_assert_eq!(report.messages, waiting + outbox.in_flight.len());
-                prop_assert_eq!(outbox.latest_of.len(), outbox.latest.len());
-                let all = || outbox.events.values().chain(outbox.latest.values()).chain(outbox.in_flight.values());
-                prop_assert_eq!(report.bytes, all().map(|entry| entry.message.size()).sum::<usize>());
-                let events = || all().filter(|entry| !entry.message.retain);
-                prop_assert_eq!(report.held.0, events().count());
-                prop_assert_eq!(report.held.1, events().map(|entry| entry.message.size()).sum::<usize>());
-                prop_assert!(report.held.0 <= messages.max(window) && report.held.1 <= 250);
-                prop_assert!(outbox.latest.len() <= 4, "one for each retained topic");
-                let left = u64::try_from(report.messages).unwrap();
-                prop_assert_eq!(
-                    pushed,
-                    report.acknowledged + report.superseded + report.too_large + report.events_dropped + left
-                );
-            }
-        }
-    }
-}
+#[path = "outbox/outbox_tests.rs"]
+mod tests;

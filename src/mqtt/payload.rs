@@ -1,18 +1,22 @@
 //! Contents of the topics, version 1. Members may be added; none changes its meaning or leaves.
 
+use super::buffer::BufferReport;
 use super::json::{JsonWriter, is_representable};
 use super::outbox::OutboxReport;
-use crate::mapping::{AlarmDef, Objection, Source, TagDef, TagTable};
+use crate::base64;
+use crate::mapping::{AlarmDef, LineEncoding, Objection, Source, TagDef, TagTable};
 use crate::process_image::{
-    AlarmStatus, Event, NmtState, NodeIndex, NodeStatus, Priority, ProcessImage, Quality, Sample, TagIndex,
-    Value,
+    AlarmStatus, Event, NmtState, NodeIndex, NodeStatus, Priority, ProcessImage, Quality, Sample,
+    SerialMessage, TagIndex, Value,
 };
+use crate::store::Class;
 use crate::time::{Now, Timestamp};
 
 /// What does not change while the program runs.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Identity {
-    /// Stream id: made new at every start; `sid` and `seq` together name a message for ever.
+    /// Stream id of states and messages of serial lines, and of events where there is no store: made new at every start;
+    /// `sid` and `seq` together name a message of a topic for ever.
     pub sid: String,
     /// Version of the program.
     pub version: String,
@@ -38,6 +42,9 @@ pub const ONLINE: &str = r#"{"state":"online"}"#;
 /// `bridge/state` when the gateway stopped, or by last will.
 pub const OFFLINE: &str = r#"{"state":"offline"}"#;
 
+/// How every payload of version 1 begins.
+const VERSION: &str = "{\"v\":1,";
+
 /// Reason of a value that is no number.
 pub const NOT_A_NUMBER: &str = "not_a_number";
 
@@ -50,8 +57,9 @@ pub fn state(out: &mut String, table: &TagTable, image: &ProcessImage, node: Nod
         let places = def.tags.clone().map(TagIndex);
         places.zip(tags).filter(|(_, tag)| tag.published).map(|(index, tag)| (tag, image.tag(index)))
     };
-    // What is sent to the device says nothing of how far its own values can be trusted.
-    let received = published().filter(|(tag, _)| !matches!(tag.source, Source::Rpdo { .. }));
+    // What is sent to the device says nothing of how far its own values can be trusted; nor does what nobody asks it for.
+    let received = published()
+        .filter(|(tag, _)| !matches!(tag.source, Source::Rpdo { .. }) && def.is_asked_for(&tag.source));
     let quality = received.map(|(_, sample)| sample.quality).max().unwrap_or(Quality::Good);
     let mut json = JsonWriter::object(out);
     json.integer("v", 1);
@@ -146,6 +154,11 @@ pub fn event(out: &mut String, table: &TagTable, event: &Event, sid: &str) {
 
 /// In place of events that left the journal before they could be read: the number of the last of them, and how many.
 pub fn events_missed(out: &mut String, sid: &str, last: u64, missed: u64, at: Timestamp) {
+    let text = "More events came at once than the journal holds; the oldest were lost.";
+    lost_events(out, sid, (last, missed, at), text);
+}
+
+fn lost_events(out: &mut String, sid: &str, (last, missed, at): (u64, u64, Timestamp), text: &str) {
     let mut json = JsonWriter::object(out);
     json.integer("v", 1);
     json.text("sid", sid);
@@ -159,7 +172,97 @@ pub fn events_missed(out: &mut String, sid: &str, last: u64, missed: u64, at: Ti
     json.text("to", "");
     json.null("priority");
     json.integer("value", missed);
-    json.text("text", "More events came at once than the journal holds; the oldest were lost.");
+    json.text("text", text);
+    json.finish();
+}
+
+/// In place of events that the store lost, because there was no room or because they were damaged: the number of the last
+/// of them, and how many.
+pub fn events_lost(out: &mut String, sid: &str, last: u64, missing: u64, at: Timestamp) {
+    let text =
+        "Events were lost before they could be sent: there was no room for them, or the disk damaged them.";
+    lost_events(out, sid, (last, missing, at), text);
+}
+
+/// An event without what [`with_stream`] puts before it. Both go together: stream and number of an event that is kept are
+/// known when it comes out of the store.
+#[must_use]
+pub fn without_stream<'a>(event: &'a str, sid: &str, seq: u64) -> &'a str {
+    let head = stream_head(sid, seq);
+    event.strip_prefix(head.as_str()).unwrap_or(event)
+}
+
+/// An event with its stream and number.
+#[must_use]
+pub fn with_stream(sid: &str, seq: u64, rest: &str) -> String {
+    stream_head(sid, seq) + rest
+}
+
+/// How every event begins.
+fn stream_head(sid: &str, seq: u64) -> String {
+    let mut head = String::new();
+    let mut json = JsonWriter::object(&mut head);
+    json.integer("v", 1);
+    json.text("sid", sid);
+    json.integer("seq", seq);
+    head.push(',');
+    head
+}
+
+/// `<node>/history`: a state of another time.
+#[must_use]
+pub fn historical(state: &str) -> String {
+    let rest = state.strip_prefix(VERSION).unwrap_or_default();
+    format!("{VERSION}\"historical\":true,{rest}")
+}
+
+/// `<node>/serial/<number>/rx`: a message that came in on a serial line, and how many before it left the image before they
+/// could be read.
+pub fn serial_message(
+    out: &mut String,
+    message: &SerialMessage,
+    encoding: LineEncoding,
+    sid: &str,
+    missed: u64,
+) {
+    let text = match encoding {
+        LineEncoding::Text => std::str::from_utf8(&message.bytes).ok().filter(|text| is_plain(text)),
+        LineEncoding::Base64 => None,
+    };
+    let mut json = JsonWriter::object(out);
+    json.integer("v", 1);
+    json.integer("ts", message.at.as_millis());
+    json.text("sid", sid);
+    json.integer("seq", message.number);
+    json.text("encoding", if text.is_some() { "text" } else { "base64" });
+    match text {
+        Some(text) => json.text("data", text),
+        None => json.text("data", &base64::encode(&message.bytes)),
+    }
+    json.integer("bytes", number(message.bytes.len()));
+    json.text("end", message.end);
+    json.integer("missed", missed);
+    json.finish();
+}
+
+/// Whether a text has no control characters but tabs: others are data, and many readers lose them.
+fn is_plain(text: &str) -> bool {
+    text.chars().all(|c| c == '\t' || !c.is_control())
+}
+
+/// `bridge/response/serial_send`: what became of a request. `transaction` is `None` where it was no text.
+pub fn serial_response(
+    out: &mut String,
+    (node, channel): (&str, u8),
+    transaction: Option<&str>,
+    (result, message): (&str, &str),
+) {
+    let mut json = JsonWriter::object(out);
+    json.optional_text("transaction", transaction);
+    json.text("node", node);
+    json.integer("channel", channel);
+    json.text("result", result);
+    json.text("message", message);
     json.finish();
 }
 
@@ -187,7 +290,7 @@ pub fn info(out: &mut String, table: &TagTable, identity: &Identity) {
             nodes.element(|json| {
                 json.text("name", &node.name);
                 json.optional_text("bus", table.buses.get(node.bus.0).map(|bus| bus.name.as_str()));
-                json.integer("id", node.canopen.id.get());
+                json.integer("id", node.number());
                 json.integer("unit_id", node.unit_id);
                 json.text("mapping", &node.device.mapping);
                 json.text("vendor", &node.device.vendor);
@@ -205,7 +308,7 @@ pub fn health(
     image: &ProcessImage,
     identity: &Identity,
     now: Now,
-    outbox: &OutboxReport,
+    (outbox, buffer): (&OutboxReport, Option<&BufferReport>),
 ) {
     let uptime = now.instant.since(identity.started.instant);
     let count =
@@ -234,6 +337,9 @@ pub fn health(
         }
     });
     json.nested("outbox", |json| outbox_members(json, outbox, uptime.as_secs()));
+    if let Some(buffer) = buffer {
+        json.nested("buffer", |json| buffer_members(json, buffer));
+    }
     json.finish();
 }
 
@@ -249,11 +355,34 @@ fn outbox_members(json: &mut JsonWriter<'_>, outbox: &OutboxReport, uptime_s: u6
     json.integer("superseded", outbox.superseded);
     json.integer("too_large", outbox.too_large);
     json.integer("events_missed", outbox.events_missed);
+    // Only MQTT 5 lets a broker refuse a message.
+    if outbox.refused > 0 {
+        json.integer("refused", outbox.refused);
+    }
     json.nested("dropped", |json| {
         for (class, dropped) in outbox.dropped() {
             json.integer(class, dropped);
         }
     });
+}
+
+fn buffer_members(json: &mut JsonWriter<'_>, buffer: &BufferReport) {
+    let store = &buffer.store;
+    json.text("state", store.state.word());
+    json.text("reason", &store.reason);
+    json.integer("bytes", store.bytes);
+    json.integer("bytes_limit", store.bytes_limit);
+    json.value("hours_left", buffer.hours_left.map(Value::Float), 1);
+    for (name, counts) in [("waiting", store.records), ("dropped", store.dropped), ("damaged", store.damaged)]
+    {
+        json.nested(name, |json| {
+            for (class, count) in Class::ALL.into_iter().zip(counts) {
+                json.integer(class.word(), count);
+            }
+        });
+    }
+    json.integer("faults", store.faults);
+    json.value("written_per_payload", store.written_per_payload().map(Value::Float), 2);
 }
 
 fn number(count: usize) -> u64 {

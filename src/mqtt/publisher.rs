@@ -2,29 +2,46 @@
 //!
 //! - The state of a node goes out when a published value, its quality or the node's state changed, at least
 //!   `min_interval` after the message before, and at the latest `max_interval` after it.
-//! - Alarms, availability and events are never held back.
+//! - Alarms, availability, events and messages of serial lines are never held back.
 //! - Every session begins with the birth: all that is retained, and `bridge/state` last, so that whoever sees
 //!   "online" sees nothing that is older than it.
-//! - Without a session only events are collected; all else is made anew at the next birth.
+//! - Without a session events and messages of serial lines are collected, and states where there is a store; all else is made
+//!   anew at the next birth.
+//! - With a store events go through it, and so do the states that are not told live: those make the history.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use super::buffer::Buffer;
+use super::home_assistant::HomeAssistant;
+use super::line_reader::LineReaders;
 use super::outbox::{Limits, Message, MessageId, Outbox, OutboxReport, Outgoing};
-use super::payload::{self, Identity, Stamp};
+use super::payload::{self, Identity};
+use super::requests::{Response, VerbTopics};
+use super::serial_command::SerialAnswer;
 use super::settings::{MqttSettings, StateQos};
-use super::told::{NodeState, differs, is_same_alarm, watched};
+use super::told::{NodeState, watched};
 use super::topics::Topics;
-use crate::mapping::{NodeDef, TagTable};
-use crate::process_image::{AlarmStatus, NodeIndex, ProcessImage, Quality, Revision, TagIndex, Value};
+use crate::mapping::TagTable;
+use crate::process_image::{AlarmStatus, LineIndex, ProcessImage, Quality, Revision, Value};
 use crate::time::{Instant, Now};
+
+mod exchange;
+mod not_taken;
+mod stored;
+mod telling;
 
 /// Time between two messages on `bridge/health`.
 const HEALTH_INTERVAL: Duration = Duration::from_secs(30);
+/// An answer that does not reach who asked within this time is of no use to him.
+const ANSWER_EXPIRY: Duration = Duration::from_secs(60);
 /// Payloads made under one lock of the image; the rest follows under the next.
 const MOST_PER_READ: usize = 32;
 /// Events taken from the journal under one lock of the image; the rest follows under the next.
 const MOST_EVENTS_PER_READ: usize = 128;
+/// Bytes that a state is longer in the history, its topic included.
+const HISTORY_IS_LONGER: usize = "/history\n".len() - "/state".len() + "\"historical\":true,".len();
 /// Bytes of one message: what brokers take unless told otherwise is far more.
 pub const LARGEST_MESSAGE: usize = 256 * 1024;
 
@@ -33,13 +50,20 @@ pub const LARGEST_MESSAGE: usize = 256 * 1024;
 pub struct Publisher {
     table: Arc<TagTable>,
     topics: Topics,
+    home_assistant: Option<HomeAssistant>,
     identity: Identity,
     state_acknowledged: bool,
+    /// How long the state of a node is worth anything.
+    state_expiry: Option<Duration>,
     outbox: Outbox,
+    /// What goes through the store, where there is one.
+    buffer: Option<Buffer>,
+    /// Without a session a node is looked at no more often.
+    history_interval: Duration,
     session: bool,
     birth: Birth,
     nodes: Vec<NodeState>,
-    /// What was last published of each tag, by [`TagIndex`].
+    /// What was last published of each tag, by its place in the table.
     tags: Vec<Option<(Value, Quality)>>,
     /// Whether a change of the tag changes the payload: it is published, or tells whether one that is means anything.
     watched: Vec<bool>,
@@ -53,11 +77,21 @@ pub struct Publisher {
     more: bool,
     /// Events were left in the journal because of [`MOST_EVENTS_PER_READ`].
     more_events: bool,
+    /// Messages of serial lines.
+    lines: LineReaders,
+    /// Retained topics of tables before this one, to be cleared at each birth until the broker says that it did.
+    gone: BTreeSet<Arc<str>>,
+    /// Those of them whose clearing is on its way.
+    clearing: BTreeMap<MessageId, Arc<str>>,
+    /// Of the last state of nodes of tables before this one: should one come back, it goes on from there.
+    numbers: BTreeMap<String, u64>,
+    /// When events are tried again that the broker does not take for now.
+    release_at: Option<Instant>,
     /// `offline`, once the gateway stops.
     farewell: Option<MessageId>,
     /// The broker has it.
     farewell_acknowledged: bool,
-    buffer: String,
+    scratch: String,
 }
 
 /// How far the birth of this session has come.
@@ -81,11 +115,17 @@ impl Publisher {
             window: usize::from(settings.inflight),
             message: LARGEST_MESSAGE,
         };
+        let topics = Topics::new(settings.base_topic.as_str(), &table);
+        let announced = &settings.home_assistant;
         Self {
-            topics: Topics::new(settings.base_topic.as_str(), &table),
+            home_assistant: HomeAssistant::new(announced, &table, &topics, &identity.version),
+            topics,
             identity,
             state_acknowledged: settings.qos_state == StateQos::AtLeastOnce,
+            state_expiry: settings.state_expiry_s.map(|seconds| Duration::from_secs(seconds.into())),
             outbox: Outbox::new(limits),
+            buffer: None,
+            history_interval: Duration::from_millis(settings.history_interval_ms.into()),
             session: false,
             birth: Birth::Due,
             nodes: vec![NodeState::default(); table.nodes.len()],
@@ -97,9 +137,14 @@ impl Publisher {
             next_health: Instant::START,
             more: false,
             more_events: false,
+            lines: LineReaders::new(&table),
+            gone: BTreeSet::new(),
+            clearing: BTreeMap::new(),
+            numbers: BTreeMap::new(),
+            release_at: None,
             farewell: None,
             farewell_acknowledged: false,
-            buffer: String::new(),
+            scratch: String::new(),
             table,
         }
     }
@@ -122,35 +167,60 @@ impl Publisher {
         self.seen = None;
     }
 
+    /// What the broker had kept on [`subscriptions`](Self::subscriptions) is on its way, or cannot be had: what would take its
+    /// place may be sent.
+    pub fn handle_subscribed(&mut self) {
+        self.home_assistant.iter_mut().for_each(HomeAssistant::handle_subscribed);
+    }
+
     /// The session ended: what was not acknowledged is kept or made anew.
     pub fn handle_session_down(&mut self) {
         self.session = false;
         self.more = false;
-        self.outbox.handle_session_down();
+        self.release_at = None;
+        self.home_assistant.iter_mut().for_each(HomeAssistant::handle_session_down);
+        let unsent = self.outbox.handle_session_down();
+        self.keep_samples(unsent);
     }
 
     /// The broker has a message.
     pub fn handle_acknowledged(&mut self, id: MessageId) {
         self.farewell_acknowledged |= self.farewell == Some(id);
-        self.outbox.handle_acknowledged(id);
+        if let Some(topic) = self.clearing.remove(&id) {
+            self.gone.remove(&topic);
+        }
+        let stored = self.outbox.handle_acknowledged(id);
+        if let (Some(buffer), Some(stored)) = (&mut self.buffer, stored) {
+            buffer.acknowledge(stored);
+        }
     }
 
     /// The image as it stands. To be called when it changed and when [`poll_timeout`](Self::poll_timeout) is due: all
     /// that becomes due is made from the image, so one verb serves both.
     pub fn handle_image(&mut self, now: Now, image: &ProcessImage) {
         self.collect_events(image);
-        if !self.session {
+        self.collect_messages(image);
+        let mut left = MOST_PER_READ;
+        if !self.session && self.buffer.is_none() {
             return;
         }
         self.more = false;
-        let mut left = MOST_PER_READ;
+        if !self.session {
+            self.publish_nodes(now, image, &mut left);
+            self.seen = if self.more { None } else { Some(image.revision) };
+            return;
+        }
+        self.keep_overdue(now);
+        self.release_held(now);
         if self.birth == Birth::Due {
-            payload::info(&mut self.buffer, &self.table, &self.identity);
-            self.push(Arc::clone(&self.topics.bridge_info), true, true);
+            self.clear_gone(now);
+            payload::info(&mut self.scratch, &self.table, &self.identity);
+            self.push(Arc::clone(&self.topics.bridge_info), true);
             self.next_health = now.instant;
             self.birth = Birth::Nodes;
         }
         self.publish_health(now, image);
+        self.publish_announcements(&mut left);
         if self.seen != Some(image.revision) {
             self.publish_alarms(image, &mut left);
         }
@@ -166,7 +236,9 @@ impl Publisher {
     pub fn handle_stop(&mut self) {
         self.more = false;
         self.more_events = false;
-        self.outbox.clear_waiting();
+        self.lines.stop();
+        let unsent = self.outbox.clear_waiting();
+        self.keep_samples(unsent);
         self.farewell = self.publish_bridge_state(payload::OFFLINE);
     }
 
@@ -178,23 +250,31 @@ impl Publisher {
     /// When [`handle_image`](Self::handle_image) is to be called at the latest.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
-        if self.more_events {
+        if self.more_events || self.lines.has_more() {
             return Some(Instant::START);
         }
-        if !self.session {
+        let stored = self.buffer.as_ref().and_then(|buffer| buffer.poll_timeout(&self.outbox, self.session));
+        if !self.session && self.buffer.is_none() {
             return None;
         }
-        if self.more || self.birth != Birth::Done {
+        let announces = self.home_assistant.as_ref().is_some_and(HomeAssistant::has_more);
+        if self.more || (self.session && (announces || self.birth != Birth::Done)) {
             return Some(Instant::START);
         }
-        let nodes = self.table.nodes.iter().zip(&self.nodes).map(|(def, node)| node.due(def));
-        nodes.chain([self.next_health]).min()
+        let nodes = self.table.nodes.iter().zip(&self.nodes).map(|(def, node)| self.due(def, node));
+        let health = self.session.then_some(self.next_health);
+        nodes.chain(health).chain(self.release_at).chain(self.overdue_at()).chain(stored).min()
     }
 
     /// Fill and counters of the outbox.
     #[must_use]
     pub fn report(&self) -> &OutboxReport {
         self.outbox.report()
+    }
+
+    /// How many states were made of each node: the number of its newest.
+    pub fn states_made(&self) -> impl Iterator<Item = u64> + '_ {
+        self.nodes.iter().map(|node| node.seq)
     }
 
     /// Messages that are sent and not acknowledged.
@@ -206,13 +286,14 @@ impl Publisher {
     /// Whether the image holds more than one read takes: [`handle_image`](Self::handle_image) is to be called again.
     #[must_use]
     pub fn has_more(&self) -> bool {
-        self.more || self.more_events
+        self.more || self.more_events || self.lines.has_more()
     }
 
     /// Whether everything that was to be told has been acknowledged.
     #[must_use]
     pub fn is_idle(&self) -> bool {
-        self.outbox.is_empty() && !self.has_more()
+        let stored = self.buffer.as_ref().is_none_or(|buffer| buffer.is_idle() && !buffer.has_events());
+        self.outbox.is_empty() && !self.has_more() && stored
     }
 
     /// Whether the broker has the `offline` of [`handle_stop`](Self::handle_stop).
@@ -222,159 +303,102 @@ impl Publisher {
     }
 
     fn collect_events(&mut self, image: &ProcessImage) {
+        if self.waits_for_store() {
+            self.more_events = self.cursor < image.journal.newest();
+            return;
+        }
         let (events, missed) = image.journal.since(self.cursor);
         let mut events = events.take(MOST_EVENTS_PER_READ).peekable();
         if let (Some(oldest), true) = (events.peek(), missed > 0) {
             self.outbox.count_missed(missed);
             let last = oldest.seq.saturating_sub(1);
-            payload::events_missed(&mut self.buffer, &self.identity.sid, last, missed, oldest.ts);
-            self.push(Arc::clone(&self.topics.event), true, false);
+            payload::events_missed(&mut self.scratch, &self.identity.sid, last, missed, oldest.ts);
+            self.keep_event(last);
         }
         for event in events {
-            payload::event(&mut self.buffer, &self.table, event, &self.identity.sid);
-            self.push(Arc::clone(&self.topics.event), true, false);
+            payload::event(&mut self.scratch, &self.table, event, &self.identity.sid);
+            self.keep_event(event.seq);
             self.cursor = event.seq;
         }
         self.more_events = self.cursor < image.journal.newest();
     }
 
-    fn publish_health(&mut self, now: Now, image: &ProcessImage) {
-        if now.instant < self.next_health {
-            return;
-        }
-        self.next_health = now.instant + HEALTH_INTERVAL;
-        let report = *self.outbox.report();
-        payload::health(&mut self.buffer, &self.table, image, &self.identity, now, &report);
-        self.push(Arc::clone(&self.topics.bridge_health), true, true);
-        if self.birth == Birth::Done {
-            // The last will of a session before this one may have come late.
-            self.publish_bridge_state(payload::ONLINE);
-        }
-    }
-
-    fn publish_bridge_state(&mut self, state: &str) -> Option<MessageId> {
-        self.buffer.clear();
-        self.buffer.push_str(state);
-        self.push(Arc::clone(&self.topics.bridge_state), true, true)
-    }
-
-    fn publish_alarms(&mut self, image: &ProcessImage, left: &mut usize) {
-        let table = Arc::clone(&self.table);
-        for (place, (def, status)) in table.alarms.iter().zip(&image.alarms).enumerate() {
-            let told = self.alarms.get(place).copied().flatten();
-            if told.is_some_and(|told| is_same_alarm(&told, status)) {
-                continue;
-            }
-            if !self.take_one(left) {
-                return;
-            }
-            payload::alarm(&mut self.buffer, &table, def, status);
-            if let Some(topic) = self.topics.alarms.get(place).cloned() {
-                self.push(topic, true, true);
-            }
-            if let Some(told) = self.alarms.get_mut(place) {
-                *told = Some(*status);
+    /// Messages of serial lines are kept like events: none is left out without a word.
+    fn collect_messages(&mut self, image: &ProcessImage) {
+        self.lines.begin();
+        while let Some(new) = self.lines.next(image) {
+            payload::serial_message(
+                &mut self.scratch,
+                new.message,
+                new.encoding,
+                &self.identity.sid,
+                new.missed,
+            );
+            if let Some(topics) = self.topics.lines.get(new.line.0) {
+                let topic = Arc::clone(&topics.rx);
+                self.push(topic, false);
             }
         }
     }
 
-    fn publish_nodes(&mut self, now: Now, image: &ProcessImage, left: &mut usize) {
-        let table = Arc::clone(&self.table);
-        let changed = self.seen != Some(image.revision);
-        for (place, def) in table.nodes.iter().enumerate() {
-            if changed && !self.publish_availability(place, image, left) {
-                return;
-            }
-            if changed {
-                self.note_changes(place, def, image);
-            }
-            let due = self.nodes.get(place).is_some_and(|node| node.due(def) <= now.instant);
-            if due && !self.take_one(left) {
-                return;
-            }
-            if due {
-                self.publish_state(now, place, def, image);
-            }
-        }
+    /// The answer to a request to send on a line.
+    pub fn handle_serial_answer(&mut self, now: Now, answer: &SerialAnswer) {
+        let line = (&*answer.node, answer.number);
+        let said = (answer.result, answer.message.as_str());
+        payload::serial_response(&mut self.scratch, line, answer.transaction.as_deref(), said);
+        let topic = Arc::clone(&self.topics.serial_response);
+        self.push_answer(now, topic, None);
     }
 
-    /// Tells whether a node is there, when that changed. `false` when that has to wait for the next read.
-    fn publish_availability(&mut self, place: usize, image: &ProcessImage, left: &mut usize) -> bool {
-        let (Some(status), Some(node)) = (image.nodes.get(place), self.nodes.get(place)) else { return true };
-        let told = node.availability.as_ref();
-        if told.is_some_and(|(online, reason)| {
-            *online == status.online && (status.online || *reason == status.reason)
-        }) {
-            return true;
-        }
-        if !self.take_one(left) {
-            return false;
-        }
-        payload::availability(&mut self.buffer, status);
-        if let Some(topics) = self.topics.nodes.get(place) {
-            let topic = Arc::clone(&topics.availability);
-            self.push(topic, true, true);
-        }
-        if let Some(node) = self.nodes.get_mut(place) {
-            node.availability = Some((status.online, status.reason.clone()));
-        }
-        true
+    /// What became of a request is published.
+    pub fn handle_response(&mut self, now: Now, response: &Response) {
+        self.scratch.clear();
+        self.scratch.push_str(&response.payload);
+        self.push_answer(now, Arc::clone(&response.topic), response.correlation.clone());
     }
 
-    /// Marks a node whose published values, what is to be said against them, or NMT state are not those that were told.
-    fn note_changes(&mut self, place: usize, def: &NodeDef, image: &ProcessImage) {
-        let table = &self.table;
-        let Some(node) = self.nodes.get_mut(place) else { return };
-        node.fast = def.publish.fast_while.is_some_and(|tag| {
-            let sample = image.tag(tag);
-            sample.quality.is_usable() && sample.value.is_true()
-        });
-        if node.dirty {
-            return;
-        }
-        let told = self.tags.get(def.tags.clone()).unwrap_or_default();
-        let watched = self.watched.get(def.tags.clone()).unwrap_or_default();
-        let tags = table.tags.get(def.tags.clone()).unwrap_or_default().iter().zip(told).zip(watched);
-        let moved = def.tags.clone().zip(tags).any(|(index, ((tag, told), watched))| {
-            if !watched {
-                return false;
-            }
-            let sample = image.tag(TagIndex(index));
-            told.is_none_or(|(value, quality)| {
-                quality != sample.quality || differs(value, sample.value, tag.deadband)
-            })
-        });
-        node.dirty = moved || image.nodes.get(place).is_some_and(|status| status.nmt != node.nmt);
+    /// Who asked does not wait for ever.
+    fn push_answer(&mut self, now: Now, topic: Arc<str>, correlation: Option<Arc<[u8]>>) {
+        let message = Message::event(topic, self.scratch.as_str().into());
+        self.outbox.push(Message { expires: Some(now.instant + ANSWER_EXPIRY), correlation, ..message });
     }
 
-    fn publish_state(&mut self, now: Now, place: usize, def: &NodeDef, image: &ProcessImage) {
-        let Some(node) = self.nodes.get_mut(place) else { return };
-        node.seq += 1;
-        node.published = Some(now.instant);
-        node.dirty = false;
-        node.nmt = image.nodes.get(place).and_then(|status| status.nmt);
-        let stamp = Stamp { sid: &self.identity.sid, seq: node.seq };
-        payload::state(&mut self.buffer, &self.table, image, NodeIndex(place), stamp);
-        for (index, told) in def.tags.clone().zip(self.tags.get_mut(def.tags.clone()).unwrap_or_default()) {
-            let sample = image.tag(TagIndex(index));
-            *told = Some((sample.value, sample.quality));
-        }
-        if let Some(topics) = self.topics.nodes.get(place) {
-            let topic = Arc::clone(&topics.state);
-            self.push(topic, self.state_acknowledged, true);
-        }
+    /// The request topics.
+    #[must_use]
+    pub fn request_topics(&self) -> Vec<VerbTopics> {
+        self.topics.requests.clone()
     }
 
-    /// Uses up one of the payloads that may still be made under this lock.
-    fn take_one(&mut self, left: &mut usize) -> bool {
-        self.more = *left == 0;
-        *left = left.saturating_sub(1);
-        !self.more
+    /// What there is.
+    #[must_use]
+    pub fn table(&self) -> &Arc<TagTable> {
+        &self.table
+    }
+
+    /// The command topics that are read, and their lines; none unless the installation allows it.
+    #[must_use]
+    pub fn command_topics(&self) -> Vec<(Arc<str>, LineIndex)> {
+        let lines = self.table.lines.iter().zip(&self.topics.lines).enumerate();
+        let written = lines.filter(|(_, (def, _))| def.mqtt.write);
+        written.map(|(place, (_, topics))| (Arc::clone(&topics.tx), LineIndex(place))).collect()
+    }
+
+    /// What is to be subscribed beside the command topics.
+    #[must_use]
+    pub fn subscriptions(&self) -> Vec<String> {
+        self.home_assistant.as_ref().map(HomeAssistant::subscriptions).unwrap_or_default()
+    }
+
+    /// A message of a topic of [`subscriptions`](Self::subscriptions) came; others are left alone.
+    pub fn handle_message(&mut self, topic: &str, payload: &[u8], retained: bool) {
+        if let Some(home_assistant) = &mut self.home_assistant {
+            home_assistant.handle_message(topic, payload, retained);
+        }
     }
 
     /// Puts what stands in the buffer into the outbox.
-    fn push(&mut self, topic: Arc<str>, at_least_once: bool, retain: bool) -> Option<MessageId> {
-        let payload = Arc::from(self.buffer.as_str());
-        self.outbox.push(Message { topic, payload, at_least_once, retain })
+    fn push(&mut self, topic: Arc<str>, retain: bool) -> Option<MessageId> {
+        let payload = Arc::from(self.scratch.as_str());
+        self.outbox.push(Message { retain, ..Message::event(topic, payload) })
     }
 }

@@ -3,7 +3,9 @@
 use std::fmt::Write as _;
 use std::sync::Arc;
 
-use crate::mapping::{AlarmDef, AlarmOwner, TagTable};
+use super::requests::VerbTopics;
+use crate::gateway::command::request::VERBS;
+use crate::mapping::{AlarmDef, AlarmOwner, LineDef, TagTable};
 
 /// Every topic of one gateway, made once.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -20,6 +22,21 @@ pub struct Topics {
     pub nodes: Vec<NodeTopics>,
     /// By [`AlarmIndex`](crate::process_image::AlarmIndex).
     pub alarms: Vec<Arc<str>>,
+    /// By [`LineIndex`](crate::process_image::LineIndex).
+    pub lines: Vec<LineTopics>,
+    /// `bridge/response/serial_send`: what became of requests to send on a line.
+    pub serial_response: Arc<str>,
+    /// `bridge/request/<verb>` and `bridge/response/<verb>`.
+    pub requests: Vec<VerbTopics>,
+}
+
+/// The topics of one serial line.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LineTopics {
+    /// `<node>/serial/<number>/rx`: messages that came in.
+    pub rx: Arc<str>,
+    /// `<node>/serial/<number>/tx`: what is to go out; the only topics that are subscribed.
+    pub tx: Arc<str>,
 }
 
 /// The topics of one node, its alarms apart.
@@ -41,15 +58,28 @@ impl Topics {
             state: topic(&format!("{}/state", level(name))),
             availability: topic(&format!("{}/availability", level(name))),
         };
+        let line_topics = |line: &LineDef| {
+            let node = table.node(line.node).map_or("node", |node| node.name.as_str());
+            let path = format!("{}/serial/{}", level(node), line.number);
+            LineTopics { rx: topic(&format!("{path}/rx")), tx: topic(&format!("{path}/tx")) }
+        };
         Self {
             bridge_state: topic("bridge/state"),
             bridge_info: topic("bridge/info"),
             bridge_health: topic("bridge/health"),
             event: topic("event"),
             nodes: table.nodes.iter().map(|node| node_topics(&node.name)).collect(),
+            lines: table.lines.iter().map(line_topics).collect(),
+            serial_response: topic("bridge/response/serial_send"),
+            requests: VERBS.map(|verb| verb_topics(verb, topic)).to_vec(),
             alarms: table.alarms.iter().map(|alarm| topic(&alarm_path(table, alarm))).collect(),
         }
     }
+}
+
+fn verb_topics(verb: &'static str, topic: impl Fn(&str) -> Arc<str>) -> VerbTopics {
+    let (request, response) = (format!("bridge/request/{verb}"), format!("bridge/response/{verb}"));
+    VerbTopics { verb, request: topic(&request), response: topic(&response) }
 }
 
 /// The path of an alarm below the gateway's prefix.

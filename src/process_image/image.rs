@@ -2,7 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use super::{AlarmIndex, AlarmStatus, BusStatus, Journal, NodeIndex, NodeStatus, Quality, Sample, TagIndex};
+use super::{
+    AlarmIndex, AlarmStatus, BusStatus, Journal, NodeIndex, NodeStatus, Quality, Sample, SerialLine, TagIndex,
+};
 use crate::time::Instant;
 
 /// Counts up with every change of the image. A reader remembers the last one it has seen.
@@ -27,6 +29,8 @@ pub struct ProcessImage {
     pub buses: Vec<BusStatus>,
     /// By [`AlarmIndex`].
     pub alarms: Vec<AlarmStatus>,
+    /// By [`LineIndex`](super::LineIndex).
+    pub lines: Vec<SerialLine>,
     /// The last events.
     pub journal: Journal,
     /// Whether the MQTT session is up; written by the supervisor's health reports.
@@ -48,6 +52,7 @@ impl ProcessImage {
             nodes: vec![NodeStatus::default(); nodes],
             buses: vec![BusStatus::default(); buses],
             alarms: vec![AlarmStatus::default(); alarms],
+            lines: Vec::new(),
             journal: Journal::new(),
             mqtt_connected: false,
             clock_synchronised: false,

@@ -49,7 +49,7 @@ impl EventKind {
 /// One thing that happened.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Event {
-    /// Counts up by one without a gap, from 1.
+    /// Counts up by one without a gap, from 1, or from the number after the last that is on disk.
     pub seq: u64,
     /// When it happened, UTC.
     pub ts: Timestamp,
@@ -81,6 +81,8 @@ pub struct Journal {
     events: VecDeque<Event>,
     capacity: usize,
     newest: u64,
+    /// The number before the first event that was ever in it.
+    before: u64,
 }
 
 impl Journal {
@@ -96,7 +98,13 @@ impl Journal {
     /// An empty journal that keeps `capacity` events, at least one.
     #[must_use]
     pub fn with_capacity(capacity: usize) -> Self {
-        Self { events: VecDeque::new(), capacity: capacity.max(1), newest: 0 }
+        Self { events: VecDeque::new(), capacity: capacity.max(1), newest: 0, before: 0 }
+    }
+
+    /// An empty journal whose first event will have the number `newest` + 1: it goes on where another one ended.
+    #[must_use]
+    pub fn after_number(newest: u64) -> Self {
+        Self { newest, before: newest, ..Self::new() }
     }
 
     /// Appends an event. Its `seq` must be one more than the newest's; a gap would tell readers that they missed one.
@@ -109,10 +117,30 @@ impl Journal {
         self.events.push_back(event);
     }
 
+    /// Alarms have other places now; `None`: there is no such alarm any more.
+    pub fn renumber_alarms(&mut self, new: impl Fn(AlarmIndex) -> Option<AlarmIndex>) {
+        for event in &mut self.events {
+            event.alarm = event.alarm.and_then(&new);
+        }
+    }
+
+    /// All events, and those to come, have numbers that are so much higher: another stream, which is longer, is gone on with.
+    pub fn number_higher(&mut self, by: u64) {
+        self.events.iter_mut().for_each(|event| event.seq += by);
+        self.newest += by;
+        self.before += by;
+    }
+
     /// Sequence number of the newest event, 0 before the first.
     #[must_use]
     pub fn newest(&self) -> u64 {
         self.newest
+    }
+
+    /// Events since the start.
+    #[must_use]
+    pub fn recorded(&self) -> u64 {
+        self.newest - self.before
     }
 
     /// The events after `cursor` (the last `seq` that the reader has), oldest first, and how many it missed.
@@ -176,5 +204,15 @@ mod tests {
         assert_eq!(seqs(2), (vec![3, 4, 5], 0));
         assert_eq!(seqs(4), (vec![5], 0));
         assert_eq!(seqs(5), (vec![], 0));
+    }
+
+    #[test]
+    fn a_journal_that_goes_on_after_another_has_no_gap() {
+        let mut journal = Journal::after_number(41);
+        assert_eq!((journal.newest(), journal.recorded(), journal.after(41).1), (41, 0, 0));
+        journal.append(event(42));
+        let (events, missed) = journal.after(41);
+        assert_eq!((events.len(), missed, journal.recorded()), (1, 0, 1));
+        assert_eq!(journal.after(10).1, 31, "those before are gone for it");
     }
 }

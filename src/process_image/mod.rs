@@ -6,21 +6,33 @@
 //!
 //! - [`value`], [`quality`]: what a tag holds and how far it can be trusted.
 //! - [`status`]: nodes, buses and alarms as readers see them.
+//! - [`current`]: what views make of it, exchanged when a reload makes another image.
+//! - [`frame_kind`]: kinds of frames that the gateway sends.
 //! - [`image`]: all of it at one moment.
+//! - [`serial`]: serial lines, as streams and as messages.
+//! - [`session`]: why there is no session with the MQTT broker.
 //! - [`journal`]: the last events.
 //! - [`handles`]: the writer and the readers (the only file here that knows tokio).
 
+pub mod current;
+pub mod frame_kind;
 pub mod handles;
 pub mod image;
 pub mod journal;
 pub mod quality;
+pub mod serial;
+pub mod session;
 pub mod status;
 pub mod value;
 
+pub use current::Current;
+pub use frame_kind::{FrameCounts, FrameKind};
 pub use handles::{ImageReader, ImageWriter, process_image};
 pub use image::{ProcessImage, Revision};
 pub use journal::{Event, EventKind, Journal};
 pub use quality::{Quality, Reason};
+pub use serial::{SerialLine, SerialMessage};
+pub use session::SessionTrouble;
 pub use status::{
     AlarmState, AlarmStatus, BusState, BusStatus, NodeCounters, NodeStatus, PdoStatus, Priority,
 };
@@ -38,6 +50,10 @@ pub struct TagIndex(pub usize);
 /// A node, by its place in the tag table.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct NodeIndex(pub usize);
+
+/// A serial line, by its place in the tag table.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct LineIndex(pub usize);
 
 /// An alarm, by its place in the tag table.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]

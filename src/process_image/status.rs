@@ -1,6 +1,6 @@
 //! What readers see of nodes, buses and alarms, beside the tags.
 
-use super::{ErrorLog, NmtState, Revision, Value};
+use super::{ErrorLog, FrameCounts, NmtState, Revision, Value};
 use crate::time::{Instant, Timestamp};
 
 /// What is known of one node.
@@ -102,6 +102,8 @@ pub struct NodeCounters {
     pub malformed: u64,
     /// Frames with a bit set that the mapping calls reserved.
     pub reserved_bits: u64,
+    /// Synchronous TPDOs that came after the window of SYNC (R-ESD-115).
+    pub late_pdos: u64,
     /// All frames received from this node.
     pub frames_received: u64,
 }
@@ -109,7 +111,7 @@ pub struct NodeCounters {
 impl NodeCounters {
     /// Each counter with its name in payloads and pages, and a sentence.
     #[must_use]
-    pub fn named(&self) -> [(&'static str, &'static str, u64); 11] {
+    pub fn named(&self) -> [(&'static str, &'static str, u64); 12] {
         [
             ("frames_received", "Frames received from the node", self.frames_received),
             ("restarts", "Boot-up messages after the first contact", self.restarts),
@@ -122,6 +124,7 @@ impl NodeCounters {
             ("unexpected_states", "States that were not ordered", self.unexpected_states),
             ("malformed", "Frames that cannot be right", self.malformed),
             ("reserved_bits", "Frames with a reserved bit set", self.reserved_bits),
+            ("late_pdos", "Synchronous TPDOs after the window of SYNC", self.late_pdos),
         ]
     }
 }
@@ -149,6 +152,10 @@ pub struct BusStatus {
     pub overruns: u64,
     /// Frames of identifiers that belong to no configured node, FD and 29-bit frames (R-DET-006).
     pub foreign_frames: u64,
+    /// Frames handed to the bus, by kind. Not all of them left: see [`frames_not_sent`](Self::frames_not_sent).
+    pub sent: FrameCounts,
+    /// Frames that the gateway made and the configuration does not allow: they were dropped. A bug of ours.
+    pub frames_blocked: u64,
 }
 
 impl BusStatus {
@@ -333,7 +340,8 @@ pub struct AlarmStatus {
     pub count: u64,
     /// It was the first of its group to be raised since the group was last quiet.
     pub first_out: bool,
-    /// The value that raised it, where the condition has one.
+    /// The value that raised it, where the condition has one; of an alarm for errors of a device the code of one that is
+    /// there now, or was there last.
     pub value: Option<Value>,
     /// When it changed last.
     pub revision: Revision,

@@ -1,11 +1,13 @@
 //! The closed list of devices that can be simulated. Whoever adds one begins here. Pure.
 
+use super::cbm_sio::{self, Model, SimulatedSio, SioSettings};
 use super::detcon::{self, DetconSettings, SimulatedDetcon};
 use super::device::{Device, DevicePlan};
 use super::dst_p92c::{self, DstSettings, SimulatedDst};
 use super::order;
 use super::scenario::Shipped;
 use super::slave;
+use crate::canopen::NodeId;
 use crate::time::Now;
 
 /// A kind of device.
@@ -15,6 +17,10 @@ pub enum Kind {
     Detcon,
     /// Danfoss DST P92C pressure transmitter.
     DstP92c,
+    /// esd CAN-CBM-SIO1, a serial line behind CAN.
+    CbmSio1,
+    /// esd CAN-CBM-SIO4, five serial lines behind CAN.
+    CbmSio4,
 }
 
 /// What a device of each kind is like: the `[device]` table of its scenario.
@@ -24,11 +30,13 @@ pub enum Settings {
     Detcon(DetconSettings),
     /// Of a DST P92C.
     DstP92c(Box<DstSettings>),
+    /// Of either esd module.
+    CbmSio(Box<SioSettings>),
 }
 
 impl Kind {
     /// All kinds.
-    pub const ALL: [Self; 2] = [Self::Detcon, Self::DstP92c];
+    pub const ALL: [Self; 4] = [Self::Detcon, Self::DstP92c, Self::CbmSio1, Self::CbmSio4];
 
     /// The word on the command line.
     #[must_use]
@@ -36,6 +44,8 @@ impl Kind {
         match self {
             Self::Detcon => "detcon",
             Self::DstP92c => "dst-p92c",
+            Self::CbmSio1 => "cbm-sio1",
+            Self::CbmSio4 => "cbm-sio4",
         }
     }
 
@@ -45,17 +55,19 @@ impl Kind {
         match self {
             Self::Detcon => &detcon::SCENARIOS,
             Self::DstP92c => &dst_p92c::SCENARIOS,
+            Self::CbmSio1 => &cbm_sio::SIO1_SCENARIOS,
+            Self::CbmSio4 => &cbm_sio::SIO4_SCENARIOS,
         }
     }
 
     /// What can be ordered, for people.
     #[must_use]
     pub fn help(self) -> String {
-        let own = match self {
-            Self::Detcon => detcon::control::HELP,
-            Self::DstP92c => dst_p92c::action::HELP,
-        };
-        [own, slave::HELP, order::HELP].join("\n")
+        match self {
+            Self::Detcon => [detcon::control::HELP, slave::HELP, order::HELP].join("\n"),
+            Self::DstP92c => [dst_p92c::action::HELP, slave::HELP, order::HELP].join("\n"),
+            Self::CbmSio1 | Self::CbmSio4 => [cbm_sio::action::HELP, order::HELP].join("\n"),
+        }
     }
 
     /// The order that ends another, for a step of a scenario that lasts for a time; `None` where it does not last.
@@ -63,6 +75,17 @@ impl Kind {
         match self {
             Self::Detcon => detcon::control::undo(words),
             Self::DstP92c => dst_p92c::action::undo(words),
+            Self::CbmSio1 | Self::CbmSio4 => cbm_sio::action::undo(words),
+        }
+    }
+
+    /// The highest number that such a device can have; the lowest is 1.
+    #[must_use]
+    pub const fn highest_number(self) -> u8 {
+        match self {
+            Self::Detcon | Self::DstP92c => NodeId::HIGHEST.get(),
+            Self::CbmSio1 => Model::Sio1.highest_switch(),
+            Self::CbmSio4 => Model::Sio4.highest_switch(),
         }
     }
 }
@@ -74,6 +97,10 @@ impl Settings {
         match self {
             Self::Detcon(_) => Kind::Detcon,
             Self::DstP92c(_) => Kind::DstP92c,
+            Self::CbmSio(settings) => match settings.model {
+                Model::Sio1 => Kind::CbmSio1,
+                Model::Sio4 => Kind::CbmSio4,
+            },
         }
     }
 
@@ -82,6 +109,7 @@ impl Settings {
         match self {
             Self::Detcon(settings) => detcon::control::check(settings, words).map(drop),
             Self::DstP92c(_) => dst_p92c::action::parse(words).map(drop),
+            Self::CbmSio(settings) => cbm_sio::action::check(settings, words).map(drop),
         }
     }
 }
@@ -93,6 +121,7 @@ impl DevicePlan {
         match &self.scenario.settings {
             Settings::Detcon(settings) => Box::new(SimulatedDetcon::power_on(self, settings, now)),
             Settings::DstP92c(settings) => Box::new(SimulatedDst::power_on(self, settings, now)),
+            Settings::CbmSio(settings) => Box::new(SimulatedSio::power_on(self, settings, now)),
         }
     }
 }

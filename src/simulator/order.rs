@@ -6,14 +6,14 @@
 use std::str::FromStr;
 use std::time::Duration;
 
+use super::device::DeviceNumber;
 use super::error::SimulatorError;
-use crate::canopen::NodeId;
 
 /// A control line: `knock 7 on`, or `node 2 knock 7 on` for one of several devices.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Order {
     /// Which device; all when `None`.
-    pub node: Option<NodeId>,
+    pub node: Option<DeviceNumber>,
     /// What it is to do.
     pub words: Vec<String>,
 }
@@ -39,10 +39,7 @@ impl FromStr for Order {
         let owned = |words: &[&str]| words.iter().map(|word| (*word).to_owned()).collect();
         match words.as_slice() {
             ["node", number, rest @ ..] => {
-                let id = number.parse().ok().and_then(NodeId::new);
-                let node = id.ok_or_else(|| {
-                    refused(line, format!("`{number}` is not a node id; give a number from 1 to 127"))
-                })?;
+                let node = number.parse().map_err(|reason| refused(line, reason))?;
                 Ok(Self { node: Some(node), words: owned(rest) })
             }
             all => Ok(Self { node: None, words: owned(all) }),
@@ -86,6 +83,13 @@ pub fn number(word: &str, what: &str, low: u8, high: u8) -> Result<u8, String> {
 pub fn millis(word: &str) -> Result<Duration, String> {
     let millis = word.parse().map(|millis: u32| Duration::from_millis(u64::from(millis)));
     millis.map_err(|_| format!("`{word}` is not a time; give milliseconds, for example 150"))
+}
+
+/// A bit rate of a bus in kbit/s; 0 = any.
+pub fn kbit(word: &str) -> Result<u16, String> {
+    const USUAL: [u16; 10] = [0, 10, 20, 50, 100, 125, 250, 500, 800, 1000];
+    let kbit = word.parse().ok().filter(|kbit| USUAL.contains(kbit));
+    kbit.ok_or_else(|| format!("`{word}` is not a bit rate in kbit/s; give 10 to 1000, or 0 for any"))
 }
 
 /// What ends an order that ends in a switch or a number: the same with `off`. `None` for what is an end itself.

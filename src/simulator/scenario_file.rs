@@ -8,6 +8,7 @@ use serde::de::{DeserializeOwned, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 use toml::Spanned;
 
+use super::cbm_sio;
 use super::detcon;
 use super::dst_p92c;
 use super::error::{Problem, SimulatorError};
@@ -86,6 +87,8 @@ impl Scenario {
         match kind {
             Kind::Detcon => reader.read::<detcon::DeviceTable>(),
             Kind::DstP92c => reader.read::<dst_p92c::DeviceTable>(),
+            Kind::CbmSio1 => reader.read::<cbm_sio::Sio1Table>(),
+            Kind::CbmSio4 => reader.read::<cbm_sio::Sio4Table>(),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! SIGTERM and SIGINT: the order to stop, and when it comes again, to stop at once. \[IO\]
+//! SIGTERM and SIGINT: the order to stop, and when it comes again, to stop at once; SIGHUP: to read the files again. \[IO\]
 
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
@@ -55,6 +55,23 @@ pub fn on_signal(stop: CancellationToken) -> std::io::Result<()> {
         }
     });
     Ok(())
+}
+
+/// Each SIGHUP asks for the configuration to be read again; several that come while one is dealt with are one.
+///
+/// # Errors
+/// The system refuses the signal handler.
+pub fn on_hang_up() -> std::io::Result<mpsc::Receiver<()>> {
+    let mut hang_up = signal(SignalKind::hangup())?;
+    let (ask, asked) = mpsc::channel(1);
+    tokio::spawn(async move {
+        while hang_up.recv().await.is_some() {
+            if matches!(ask.try_send(()), Err(mpsc::error::TrySendError::Closed(()))) {
+                return;
+            }
+        }
+    });
+    Ok(asked)
 }
 
 /// Stops at the first order; returns at the second.

@@ -17,6 +17,12 @@ pub const SHUTDOWN_LIMIT: Duration = Duration::from_secs(5);
 pub struct Tasks {
     set: JoinSet<()>,
     names: Vec<(Id, String)>,
+    /// Those that can be stopped alone.
+    parts: Vec<(Id, CancellationToken)>,
+    /// Those that were told to stop, did not in time, and are left to it: that they end at last is no bug.
+    left: Vec<Id>,
+    /// One ended by itself while another was waited for.
+    early: Option<Result<(Id, ()), JoinError>>,
 }
 
 /// Why the tasks ended.
@@ -38,13 +44,78 @@ impl Tasks {
         self.names.push((handle.id(), name.into()));
     }
 
+    /// Starts a task that can be [stopped](Self::stop_part) alone, by a token that also ends with `stop`.
+    pub fn spawn_part<F: Future<Output = ()> + Send + 'static>(
+        &mut self,
+        name: impl Into<String>,
+        stop: &CancellationToken,
+        task: impl FnOnce(CancellationToken) -> F,
+    ) {
+        let own = stop.child_token();
+        let handle = self.set.spawn(task(own.clone()));
+        self.names.push((handle.id(), name.into()));
+        self.parts.push((handle.id(), own));
+    }
+
+    /// Stops the parts of this name and waits until they have ended, at most [`SHUTDOWN_LIMIT`]. Nothing where there is none.
+    pub async fn stop_part(&mut self, name: &str) {
+        self.stop_part_within(name, SHUTDOWN_LIMIT).await;
+    }
+
+    /// The same with a limit of its own. A part that takes longer is left to end when it will.
+    pub async fn stop_part_within(&mut self, name: &str, limit: Duration) {
+        let of_name = |id: &Id| self.names.iter().any(|(known, each)| known == id && each == name);
+        let mut waiting: Vec<Id> = Vec::new();
+        for (id, stop) in self.parts.iter().filter(|(id, _)| of_name(id)) {
+            stop.cancel();
+            waiting.push(*id);
+        }
+        self.parts.retain(|(id, _)| !waiting.contains(id));
+        let all = async {
+            while !waiting.is_empty()
+                && let Some(result) = self.set.join_next_with_id().await
+            {
+                let ended = id(&result);
+                let known = waiting.iter().position(|each| *each == ended).map(|place| waiting.remove(place));
+                if known.is_none() || panicked(&result) {
+                    self.note(result);
+                }
+            }
+        };
+        if tokio::time::timeout(limit, all).await.is_err() {
+            error!(task = name, "did not end within {} s; leaving it", limit.as_secs());
+            self.left.extend(waiting);
+        }
+    }
+
+    /// Waits until a task ends by itself, which none should. Cancel-safe.
+    pub async fn ended_early(&mut self) {
+        while self.early.is_none() {
+            match self.set.join_next_with_id().await {
+                Some(result) => self.note(result),
+                None => std::future::pending().await,
+            }
+        }
+    }
+
+    /// A task ended that nobody waits for.
+    fn note(&mut self, result: Result<(Id, ()), JoinError>) {
+        let ended = id(&result);
+        self.parts.retain(|(part, _)| *part != ended);
+        let was_left = self.left.iter().position(|left| *left == ended).map(|place| self.left.remove(place));
+        if was_left.is_none() || panicked(&result) {
+            self.early.get_or_insert(result);
+        }
+    }
+
     /// Waits until `stop` is cancelled or a task ends by itself; then stops all and waits for them, at most
     /// [`SHUTDOWN_LIMIT`]. A task that panics is a bug at any time, also while it stops.
     pub async fn run(mut self, stop: CancellationToken) -> Ended {
-        let early = tokio::select! {
-            () = stop.cancelled() => None,
-            ended = self.set.join_next_with_id() => ended,
-        };
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = self.ended_early() => {}
+        }
+        let early = self.early.take();
         // Told to stop and ended in the same moment: in order, unless it panicked.
         let early = early.filter(|result| !stop.is_cancelled() || panicked(result));
         let mut ended = match early {
@@ -119,6 +190,58 @@ mod tests {
         }
         stop.cancel();
         assert_eq!(tasks.run(stop).await, Ended::Stopped);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_part_is_stopped_alone_and_another_that_ends_meanwhile_is_not_forgotten() {
+        let stop = CancellationToken::new();
+        let mut tasks = Tasks::default();
+        tasks.spawn("steady", stop.clone().cancelled_owned());
+        for _ in 0..2 {
+            tasks.spawn_part("part", &stop, |stop| async move {
+                stop.cancelled().await;
+                tokio::time::sleep(Duration::from_secs(1)).await;
+            });
+        }
+        tasks.stop_part("nobody").await;
+        tasks.stop_part("part").await;
+        assert_eq!((tasks.set.len(), tasks.parts.len()), (1, 0));
+        assert!(tokio::time::timeout(Duration::from_secs(1), tasks.ended_early()).await.is_err());
+        tasks.spawn("broken", tokio::time::sleep(Duration::from_millis(500)));
+        tasks.spawn_part("part", &stop, |stop| async move {
+            stop.cancelled().await;
+            tokio::time::sleep(Duration::from_secs(1)).await;
+        });
+        tasks.stop_part("part").await;
+        tasks.ended_early().await;
+        assert_eq!(tasks.run(stop.clone()).await, Ended::Bug { task: "broken".into() });
+        assert!(stop.is_cancelled());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_part_that_is_late_is_left_and_may_end_when_it_will_unless_it_panics() {
+        let stop = CancellationToken::new();
+        let mut tasks = Tasks::default();
+        tasks.spawn("steady", stop.clone().cancelled_owned());
+        let late = |end: fn()| {
+            move |stop: CancellationToken| async move {
+                stop.cancelled().await;
+                tokio::time::sleep(SHUTDOWN_LIMIT * 2).await;
+                end();
+            }
+        };
+        tasks.spawn_part("part", &stop, late(|| {}));
+        tasks.stop_part("part").await;
+        assert!(tasks.parts.is_empty());
+        // Another of its name runs by now.
+        tasks.spawn_part("part", &stop, late(|| {}));
+        assert!(tokio::time::timeout(SHUTDOWN_LIMIT * 4, tasks.ended_early()).await.is_err());
+        tasks.stop_part_within("part", SHUTDOWN_LIMIT * 3).await;
+        assert_eq!((tasks.set.len(), tasks.left.len()), (1, 0));
+        tasks.spawn_part("part", &stop, late(|| panic!("for the test")));
+        tasks.stop_part("part").await;
+        tasks.ended_early().await;
+        assert_eq!(tasks.run(stop).await, Ended::Bug { task: "part".into() });
     }
 
     #[tokio::test(start_paused = true)]

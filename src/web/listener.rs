@@ -9,12 +9,15 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
+use axum::extract::connect_info::Connected;
+use axum::serve::IncomingStream;
 use nix::errno::Errno;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::Sleep;
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
+use super::line::{Line, Security};
 use crate::slots::{Activity, SlotId, Slots};
 use crate::time::Clock;
 
@@ -34,25 +37,26 @@ type Places = Arc<Mutex<Slots<CancellationToken>>>;
 pub struct LimitedListener {
     listener: TcpListener,
     places: Places,
+    security: Option<Arc<Security>>,
     clock: Clock,
 }
 
 impl LimitedListener {
-    /// Over a bound socket.
+    /// Over a bound socket. With `security` every connection begins with a handshake.
     #[must_use]
-    pub fn new(listener: TcpListener, clock: Clock) -> Self {
-        Self { listener, places: Arc::new(Mutex::new(Slots::new(MOST_CONNECTIONS))), clock }
+    pub fn new(listener: TcpListener, security: Option<Arc<Security>>, clock: Clock) -> Self {
+        Self { listener, places: Arc::new(Mutex::new(Slots::new(MOST_CONNECTIONS))), security, clock }
     }
 
-    fn admit(&self, stream: TcpStream, peer: SocketAddr) -> Connection<TcpStream> {
+    fn admit(&self, stream: TcpStream, peer: SocketAddr) -> Connection<Line> {
         let _ = stream.set_nodelay(true);
         let place = Place::take(&self.places, peer);
-        Connection::new(stream, place, self.clock)
+        Connection::new(Line::new(stream, peer, self.security.as_ref()), place, self.clock)
     }
 }
 
 impl axum::serve::Listener for LimitedListener {
-    type Io = Connection<TcpStream>;
+    type Io = Connection<Line>;
     type Addr = SocketAddr;
 
     async fn accept(&mut self) -> (Self::Io, SocketAddr) {
@@ -74,6 +78,16 @@ impl axum::serve::Listener for LimitedListener {
 
     fn local_addr(&self) -> io::Result<SocketAddr> {
         self.listener.local_addr()
+    }
+}
+
+/// Who is at the other end of a connection.
+#[derive(Clone, Copy, Debug)]
+pub struct Peer(pub SocketAddr);
+
+impl Connected<IncomingStream<'_, LimitedListener>> for Peer {
+    fn connect_info(stream: IncomingStream<'_, LimitedListener>) -> Self {
+        Self(*stream.remote_addr())
     }
 }
 
@@ -192,11 +206,14 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(context)
+        let polled = Pin::new(&mut self.stream).poll_flush(context);
+        // What waits here for a client that takes nothing waits no longer than elsewhere.
+        if polled.is_pending() && self.is_over(context) { over() } else { polled }
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(context)
+        let polled = Pin::new(&mut self.stream).poll_shutdown(context);
+        if polled.is_pending() && self.is_over(context) { over() } else { polled }
     }
 }
 
@@ -249,6 +266,22 @@ mod tests {
         let before = clock.now().instant;
         assert!(connection.read(&mut bytes).await.is_err(), "and none may stay for ever without one");
         assert_eq!(clock.now().instant.since(before).as_secs(), IDLE_TIMEOUT.as_secs());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn an_answer_that_nobody_takes_is_given_up_after_half_a_minute_also_where_it_is_buffered() {
+        let (connection, _far, places, clock) = connection();
+        // As TLS does: what is written waits in the stream until it is flushed.
+        let mut buffered = tokio::io::BufWriter::with_capacity(1024, connection.stream);
+        buffered.write_all(&[0; 100]).await.unwrap();
+        let mut connection = Connection::new(buffered, connection.place, clock);
+        connection.answered();
+        assert!(connection.flush().await.is_err());
+        assert_eq!(clock.now().instant.as_millis(), 30_000);
+        let mut connection = Connection::new(connection.stream, connection.place, clock);
+        assert!(connection.shutdown().await.is_err(), "nor does a goodbye hold a place");
+        drop(connection);
+        assert_eq!(lock(&places).in_use(), 0);
     }
 
     #[tokio::test(start_paused = true)]

@@ -14,7 +14,7 @@ use prometheus_client::registry::Registry;
 use super::health::{ProgramHealth, Reading, ReadingKind};
 use super::status::{About, quality_code};
 use crate::mapping::{AlarmOwner, TagTable};
-use crate::process_image::{NmtState, NodeStatus, ProcessImage, TagIndex};
+use crate::process_image::{FrameKind, NmtState, NodeStatus, ProcessImage, TagIndex};
 use crate::time::Now;
 
 /// Content type of the text.
@@ -122,7 +122,17 @@ impl Metrics {
         if let Some(mqtt) = &health.mqtt {
             self.gauge("mqtt_connected", "The MQTT session is up", &[], u8::from(mqtt.connected));
         }
-        self.counter("events", "Events since the start", &[], image.journal.newest());
+        for certificate in &health.certificates {
+            let help = "Whole days until the first certificate of a file expires";
+            let labels = vec![("file", certificate.file.clone())];
+            self.add(
+                "certificate_days_left".into(),
+                (help, ReadingKind::Gauge),
+                labels,
+                days(certificate.days_left),
+            );
+        }
+        self.counter("events", "Events since the start", &[], image.journal.recorded());
     }
 
     fn buses(&mut self, table: &TagTable, image: &ProcessImage) {
@@ -138,6 +148,13 @@ impl Metrics {
                 let name = if name == "bus_off_count" { "bus_off".into() } else { format!("bus_{name}") };
                 self.counter(name, help, labels, count);
             }
+            for kind in FrameKind::ALL {
+                let labels: &[_] = &[("bus", def.name.as_str()), ("kind", kind.word())];
+                let help = "Frames that the gateway handed to the bus, by kind";
+                self.counter("can_frames_sent", help, labels, bus.sent.of(kind));
+            }
+            let blocked = "Frames that the configuration does not allow, dropped: a bug in cangate";
+            self.counter("can_frames_blocked", blocked, labels, bus.frames_blocked);
         }
     }
 
@@ -188,6 +205,11 @@ impl Metrics {
             self.counter("alarm_raised", "Times that the alarm was raised", labels, status.count);
         }
     }
+}
+
+#[expect(clippy::as_conversions, clippy::cast_precision_loss, reason = "Prometheus counts in doubles")]
+fn days(days: i64) -> f64 {
+    days as f64
 }
 
 fn owned(labels: &[(&'static str, &str)]) -> Vec<(&'static str, String)> {

@@ -6,34 +6,40 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::body::Bytes;
-use axum::extract::rejection::{PathRejection, QueryRejection};
-use axum::extract::{Path, Query, Request, State};
-use axum::http::{HeaderName, HeaderValue, StatusCode, header};
+use axum::extract::rejection::{BytesRejection, PathRejection, QueryRejection};
+use axum::extract::{ConnectInfo, DefaultBodyLimit, FromRef, Path, Query, Request, State};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use serde::{Deserialize, Serialize};
 use tokio::net::TcpListener;
 use tokio::sync::Mutex;
 use tokio_util::sync::CancellationToken;
 
+use super::commands::Commands;
+use super::guard::{self, Guard};
 use super::health::HealthSource;
 use super::host::Hosts;
-use super::listener::LimitedListener;
+use super::line::Security;
+use super::listener::{LimitedListener, Peer};
+use super::login_routes;
 use super::metrics::{self, Metrics};
 use super::recent::Recent;
 use super::settings::WebSettings;
 use super::status::{About, Alarms, Events, NodeView, Status};
+use crate::gateway::command::Desk;
 use crate::mapping::TagTable;
-use crate::process_image::ImageReader;
+use crate::process_image::{Current, ImageReader};
 use crate::time::Clock;
+use crate::tls::TlsError;
 
 /// Description of the interface.
 pub const OPENAPI: &str = include_str!("openapi.json");
 /// The page; `{nonce}` is replaced at each request.
 const PAGE: &str = include_str!("page/index.html");
 /// Every route, as in [`OPENAPI`].
-pub const ROUTES: [&str; 11] = [
+pub const ROUTES: [&str; 15] = [
     "/",
     "/livez",
     "/readyz",
@@ -45,6 +51,10 @@ pub const ROUTES: [&str; 11] = [
     "/api/v1/alarms",
     "/api/v1/events",
     "/api/v1/openapi.json",
+    "/api/v1/commands/{verb}",
+    "/api/v1/login",
+    "/api/v1/logout",
+    "/api/v1/session",
 ];
 /// Time that open requests get at a stop.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
@@ -56,6 +66,8 @@ pub struct WebState {
     pub table: Arc<TagTable>,
     /// How it is.
     pub reader: ImageReader,
+    /// Where commands are handed in.
+    pub desk: Desk,
     /// For ages.
     pub clock: Clock,
     /// What does not change.
@@ -70,10 +82,18 @@ pub struct WebState {
 
 /// The server could not be started.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot listen on http://{address}: {source}; is the port taken? Set `listen` in `[http]`")]
-pub struct WebError {
-    address: SocketAddr,
-    source: std::io::Error,
+pub enum WebError {
+    /// The address.
+    #[error("cannot listen on http://{address}: {source}; is the port taken? Set `listen` in `[http]`")]
+    Listen {
+        /// As configured.
+        address: SocketAddr,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// A file of `[http.tls]`.
+    #[error("the page cannot be served over TLS: {0}")]
+    Files(#[from] TlsError),
 }
 
 /// A bound server.
@@ -81,21 +101,45 @@ pub struct WebError {
 pub struct Server {
     listener: TcpListener,
     address: SocketAddr,
+    security: Option<Arc<Security>>,
     router: Router,
+    shown: Shown,
     clock: Clock,
+}
+
+/// What a server shows, to exchange it while it runs: each request is answered from one piece.
+#[derive(Clone, Debug)]
+pub struct Shown(Current<Site>);
+
+impl Shown {
+    /// Requests from now on are answered from this. Who is logged in stays so as long as the access tables let him, and who failed
+    /// to log in too often is shut out as before.
+    pub fn set(&self, state: WebState) {
+        let commands = self.0.get().commands.at(state.desk.clone(), Arc::clone(&state.table));
+        self.0.set(Site { state, recent: Answers::default(), commands });
+    }
 }
 
 impl Server {
     /// Binds the address. Nothing is answered before [`run`](Self::run).
     ///
     /// # Errors
-    /// The address cannot be bound.
+    /// The address cannot be bound, or a file of `[http.tls]` cannot be used.
     pub async fn bind(settings: &WebSettings, state: WebState) -> Result<Self, WebError> {
-        let failed = |source| WebError { address: settings.listen, source };
+        let security = match settings.tls.files() {
+            Some(files) => Some(Arc::new(Security::prepare(files, state.clock).await?)),
+            None => None,
+        };
+        let failed = |source| WebError::Listen { address: settings.listen, source };
         let listener = TcpListener::bind(settings.listen).await.map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
-        let (hosts, clock) = (Hosts::new(&state.table.gateway, &settings.allowed_hosts), state.clock);
-        Ok(Self { listener, address, router: router(state, hosts), clock })
+        let hosts = Arc::new(Hosts::new(&state.table.gateway, &settings.allowed_hosts));
+        let (gateway, desk, clock) = (&state.table.gateway, state.desk.clone(), state.clock);
+        let guard = Arc::new(Guard::new(settings, gateway, Arc::clone(&hosts), desk, clock));
+        let commands = Commands::new(state.desk.clone(), Arc::clone(&state.table), Arc::clone(&guard));
+        let shown = Shown(Current::new(Site { state, recent: Answers::default(), commands }));
+        let router = router(shown.0.clone(), hosts, guard);
+        Ok(Self { listener, address, security, router, shown, clock })
     }
 
     /// Where it listens.
@@ -104,10 +148,24 @@ impl Server {
         self.address
     }
 
+    /// Where the page is, for the log.
+    #[must_use]
+    pub fn url(&self) -> String {
+        let scheme = if self.security.is_some() { "https" } else { "http" };
+        format!("{scheme}://{}/", self.address)
+    }
+
+    /// What it shows.
+    #[must_use]
+    pub fn shown(&self) -> Shown {
+        self.shown.clone()
+    }
+
     /// Answers until `stop`, then lets open requests end for a second.
     pub async fn run(self, stop: CancellationToken) {
         let stopped = stop.clone().cancelled_owned();
-        let serving = axum::serve(LimitedListener::new(self.listener, self.clock), self.router)
+        let service = self.router.into_make_service_with_connect_info::<Peer>();
+        let serving = axum::serve(LimitedListener::new(self.listener, self.security, self.clock), service)
             .with_graceful_shutdown(stopped)
             .into_future();
         let patience = async {
@@ -122,8 +180,7 @@ impl Server {
     }
 }
 
-fn router(state: WebState, hosts: Hosts) -> Router {
-    let hosts = Arc::new(hosts);
+fn router(shown: Current<Site>, hosts: Arc<Hosts>, guard: Arc<Guard>) -> Router {
     Router::new()
         .route("/", get(page))
         .route("/livez", get(|| async { json(StatusCode::OK, &Live { alive: true }) }))
@@ -136,23 +193,43 @@ fn router(state: WebState, hosts: Hosts) -> Router {
         .route("/api/v1/alarms", get(alarms))
         .route("/api/v1/events", get(events))
         .route("/api/v1/openapi.json", get(|| async { text("application/json", OPENAPI.to_owned()) }))
+        .route("/api/v1/commands/{verb}", post(command).layer(DefaultBodyLimit::max(guard::LONGEST_BODY)))
+        .merge(login_routes::routes(Arc::clone(&guard)))
         .fallback(|| async {
             error(StatusCode::NOT_FOUND, "there is no such page; see /api/v1/openapi.json")
         })
         .method_not_allowed_fallback(|| async {
-            error(StatusCode::METHOD_NOT_ALLOWED, "everything here is read with GET; nothing can be changed")
+            error(
+                StatusCode::METHOD_NOT_ALLOWED,
+                "everything here is read with GET; only commands and logins are sent with POST",
+            )
         })
+        .layer(axum::middleware::from_fn_with_state(Arc::clone(&guard), login_routes::may_read))
         .layer(axum::middleware::from_fn_with_state(hosts, only_for_us))
+        .layer(axum::middleware::from_fn_with_state(guard, login_routes::in_pace))
         .layer(axum::middleware::map_response(with_headers))
-        .with_state(Arc::new(Site { state, recent: Answers::default() }))
+        .with_state(shown)
 }
 
 type Shared = State<Arc<Site>>;
+
+impl FromRef<Current<Site>> for Arc<Site> {
+    fn from_ref(current: &Current<Site>) -> Self {
+        current.get()
+    }
+}
 
 /// What the routes share.
 struct Site {
     state: WebState,
     recent: Answers,
+    commands: Commands,
+}
+
+impl std::fmt::Debug for Site {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Site").finish_non_exhaustive()
+    }
 }
 
 /// The last answers of the routes that copy the whole image. Behind a lock each, so that of many who ask at once one
@@ -190,7 +267,7 @@ struct EventsQuery {
 async fn page() -> Response {
     let nonce = uuid::Uuid::new_v4().simple().to_string();
     let policy = format!(
-        "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; \
+        "default-src 'none'; img-src data:; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; \
          base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     );
     let mut response = text("text/html; charset=utf-8", PAGE.replace("{nonce}", &nonce));
@@ -278,7 +355,19 @@ async fn events(State(site): Shared, query: Result<Query<EventsQuery>, QueryReje
     json(StatusCode::OK, &reader.read(|image| Events::after(table, image, after)))
 }
 
-fn json(code: StatusCode, body: &impl Serialize) -> Response {
+async fn command(
+    State(site): Shared,
+    ConnectInfo(Peer(peer)): ConnectInfo<Peer>,
+    verb: Result<Path<String>, PathRejection>,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Response {
+    // What is no text is no command either.
+    let verb = verb.map(|Path(verb)| verb).unwrap_or_default();
+    site.commands.answer(peer, &verb, &headers, guard::whole(body)).await
+}
+
+pub(super) fn json(code: StatusCode, body: &impl Serialize) -> Response {
     let mut response = text("application/json", bytes(body));
     *response.status_mut() = code;
     response
@@ -289,7 +378,7 @@ fn bytes(body: &impl Serialize) -> Bytes {
     serde_json::to_vec(body).unwrap_or_default().into()
 }
 
-fn error(code: StatusCode, error: &str) -> Response {
+pub(super) fn error(code: StatusCode, error: &str) -> Response {
     json(code, &Problem { error })
 }
 

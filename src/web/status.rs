@@ -4,12 +4,14 @@ use std::borrow::Cow;
 
 use serde::Serialize;
 
-use super::health::{ProgramHealth, SessionHealth};
-use crate::mapping::{AlarmDef, AlarmOwner, Derived, FieldKind, NodeDef, Objection, Source, TagTable};
+use super::health::{CertificateHealth, ClientHealth, ConfigurationHealth, ProgramHealth, SessionHealth};
+use crate::mapping::{
+    AlarmDef, AlarmOwner, Derived, FieldKind, LineDef, NodeDef, Objection, Source, TagTable,
+};
 use crate::process_image::value::rounded;
 use crate::process_image::{
     AlarmState, AlarmStatus, ErrorLog, ErrorRecord, Event, NmtState, NodeIndex, NodeStatus, Priority,
-    ProcessImage, Quality, TagIndex, Value,
+    ProcessImage, Quality, SerialLine, TagIndex, Value,
 };
 use crate::time::{Instant, Now, Timestamp};
 
@@ -43,6 +45,9 @@ pub struct Status<'a> {
     clock_synchronised: bool,
     not_ready: Vec<String>,
     mqtt: Option<SessionHealth>,
+    modbus_clients: Vec<ClientHealth>,
+    certificates: Vec<CertificateHealth>,
+    configuration: ConfigurationView,
     buses: Vec<BusView<'a>>,
     nodes: Vec<NodeView<'a>>,
     /// All that are not normal.
@@ -74,6 +79,9 @@ impl<'a> Status<'a> {
             clock_synchronised: image.clock_synchronised,
             not_ready: health.not_ready,
             mqtt: health.mqtt,
+            modbus_clients: health.modbus_clients,
+            certificates: health.certificates,
+            configuration: ConfigurationView::new(health.configuration),
             buses: BusView::all(table, image),
             nodes: nodes.filter_map(|node| NodeView::new(table, image, node, now.instant)).collect(),
             alarms: AlarmView::list(table, image, |status| status.state != AlarmState::Normal),
@@ -84,6 +92,22 @@ impl<'a> Status<'a> {
                 .map(|event| EventView::new(table, event))
                 .collect(),
         }
+    }
+}
+
+/// The configuration that runs.
+#[derive(Debug, Serialize)]
+pub struct ConfigurationView {
+    loaded: i64,
+    reloads: u64,
+    rejections: u64,
+    rejected: Option<String>,
+}
+
+impl ConfigurationView {
+    fn new(health: ConfigurationHealth) -> Self {
+        let ConfigurationHealth { loaded, reloads, rejections, rejected } = health;
+        Self { loaded: loaded.as_millis(), reloads, rejections, rejected }
     }
 }
 
@@ -132,8 +156,9 @@ pub struct NodeView<'a> {
     quality: &'static str,
     ts: Option<i64>,
     pdos: Vec<PdoView>,
+    lines: Vec<LineView<'a>>,
     errors: ErrorsView<'a>,
-    counters: Counters<11>,
+    counters: Counters<12>,
     tags: Vec<TagView<'a>>,
 }
 
@@ -177,6 +202,34 @@ impl<'a> ErrorsView<'a> {
     }
 }
 
+/// A serial line of a module.
+#[derive(Debug, Serialize)]
+struct LineView<'a> {
+    number: u8,
+    description: &'a str,
+    open: bool,
+    /// Since the gateway started.
+    bytes_received: u64,
+    messages: u64,
+    last_message: Option<i64>,
+    /// How often what came in may have a gap.
+    breaks: u64,
+}
+
+fn lines<'a>(table: &'a TagTable, image: &ProcessImage, node: NodeIndex) -> Vec<LineView<'a>> {
+    let lines = table.lines.iter().zip(&image.lines).filter(|(def, _)| def.node == node);
+    let view = |(def, line): (&'a LineDef, &SerialLine)| LineView {
+        number: def.number,
+        description: &def.description,
+        open: line.open,
+        bytes_received: line.cursor(),
+        messages: line.newest_message(),
+        last_message: line.last_message().map(|message| message.at.as_millis()),
+        breaks: line.breaks,
+    };
+    lines.map(view).collect()
+}
+
 #[derive(Debug, Serialize)]
 struct PdoView {
     number: u16,
@@ -204,7 +257,7 @@ impl<'a> NodeView<'a> {
         Some(Self {
             name: &def.name,
             bus: table.buses.get(def.bus.0).map(|bus| bus.name.as_str()),
-            id: def.canopen.id.get(),
+            id: def.number(),
             unit_id: def.unit_id,
             mapping: &def.device.mapping,
             vendor: &def.device.vendor,
@@ -219,6 +272,7 @@ impl<'a> NodeView<'a> {
             quality: quality.word(),
             ts: status.newest_data.map(Timestamp::as_millis),
             pdos: pdos(status, now),
+            lines: lines(table, image, node),
             errors: ErrorsView::new(def, &status.errors),
             counters: Counters(status.counters.named()),
             tags: tags(table, image, def, now),
@@ -266,7 +320,8 @@ fn kind(source: &Source) -> &'static str {
         | Source::Polled { field, .. }
         | Source::Adopted { field, .. }
         | Source::Rpdo { field, .. }
-        | Source::Emergency { field, .. } => field.kind == FieldKind::Bool,
+        | Source::Emergency { field, .. }
+        | Source::Module { field, .. } => field.kind == FieldKind::Bool,
         Source::Derived(derived) => {
             matches!(derived, Derived::Bit { .. } | Derived::Logic { .. } | Derived::Latch { .. })
         }

@@ -4,7 +4,7 @@ use cangate::can::{BusCounters, BusEvent, Link};
 use cangate::canopen::NmtRequest;
 use cangate::gateway::{Action, Health, Outcome};
 use cangate::mapping::At;
-use cangate::process_image::{AlarmState, EventKind, NodeIndex, Priority};
+use cangate::process_image::{AlarmState, EventKind, NodeIndex, Priority, SessionTrouble, Value};
 use cangate::time::Now;
 
 use super::{QUIET, detcon, detcon_with, running, table};
@@ -248,8 +248,8 @@ fn r_det_088_a_trip_of_100_ms_is_an_alarm_that_waits_for_a_reset() {
     assert!(conversation.alarm("trip").first_out);
     let alarm = conversation.alarm_index("trip");
     assert!(matches!(conversation.command(Action::Reset { alarm }), Outcome::Rejected(_)));
-    assert_eq!(conversation.command(Action::Acknowledge { alarm }), Outcome::Done);
-    assert!(matches!(conversation.command(Action::Acknowledge { alarm }), Outcome::Rejected(_)));
+    assert_eq!(conversation.command(Action::Acknowledge { alarm, raise: None }), Outcome::Done);
+    assert!(matches!(conversation.command(Action::Acknowledge { alarm, raise: None }), Outcome::Rejected(_)));
     assert_eq!(conversation.command(Action::Reset { alarm }), Outcome::Done);
     assert!(conversation.is_normal("trip"));
     let steps: Vec<(String, String)> = conversation
@@ -294,15 +294,64 @@ fn the_cylinder_that_knocked_first_is_told() {
 fn mqtt_that_is_down_for_a_minute_is_an_alarm_and_one_that_is_not_configured_is_none() {
     let mut conversation = running(detcon());
     conversation.run_to(100_000);
-    conversation.health(Health { mqtt_connected: Some(false), clock_synchronised: false });
+    conversation.health(Health { mqtt_connected: Some(false), ..Health::default() });
     conversation.run_to(159_000);
     assert_eq!(conversation.active(), [""; 0]);
     conversation.run_to(160_000);
     assert_eq!(conversation.active(), ["mqtt_down"]);
-    conversation.health(Health { mqtt_connected: Some(true), clock_synchronised: true });
+    conversation.health(Health { mqtt_connected: Some(true), clock_synchronised: true, ..Health::default() });
     assert!(conversation.image.mqtt_connected && conversation.image.clock_synchronised);
     conversation.run_to(166_000);
     assert_eq!(conversation.active(), [""; 0]);
+}
+
+#[test]
+fn g01_the_alarm_of_mqtt_says_why_there_is_no_session_and_follows_the_reason() {
+    let mut conversation = running(detcon());
+    let down = |mqtt_trouble| Health { mqtt_connected: Some(false), mqtt_trouble, ..Health::default() };
+    conversation.health(down(Some(SessionTrouble::Expired)));
+    conversation.run_to(200_000);
+    let told = |conversation: &Conversation| {
+        let table = &conversation.table;
+        let place = table.alarms.iter().position(|alarm| alarm.name == "mqtt_down").unwrap();
+        let value = conversation.image.alarms[place].value;
+        (value, table.alarms[place].told(value).into_owned())
+    };
+    let (value, text) = told(&conversation);
+    assert_eq!(value, Some(Value::Unsigned(21)));
+    assert_eq!(text, "There is no session with the MQTT broker. Its certificate has expired.");
+    assert_eq!(conversation.events_named("mqtt_down")[0].text, text);
+    conversation.health(down(Some(SessionTrouble::WrongHost)));
+    conversation.run_to(201_000);
+    assert_eq!(
+        told(&conversation).1,
+        "There is no session with the MQTT broker. Its certificate is for another host."
+    );
+}
+
+#[test]
+fn g06_certificates_are_told_of_a_month_and_a_week_before_they_expire_and_when_they_have() {
+    let mut conversation = running(detcon());
+    conversation.run_to(10_000);
+    let mut at = 10_000;
+    for (days, expected) in [
+        (None, ""),
+        (Some(400), ""),
+        (Some(30), ""),
+        (Some(29), "certificate_expires"),
+        (Some(7), "certificate_expires"),
+        (Some(6), "certificate_expires_soon"),
+        (Some(0), "certificate_expires_soon"),
+        (Some(-1), "certificate_expired"),
+        (Some(90), ""),
+    ] {
+        at += 1_000;
+        conversation.health(Health { certificate_days: days, ..Health::default() });
+        conversation.run_to(at);
+        let active = conversation.active();
+        assert_eq!(active.first().copied().unwrap_or_default(), expected, "{days:?}");
+        assert!(active.len() <= 1);
+    }
 }
 
 #[test]

@@ -51,11 +51,28 @@ fn a_command_to_nobody_or_over_a_bus_that_is_down_is_refused() {
     let nobody = Action::Nmt { node: NodeIndex(7), request: NmtRequest::Stop };
     assert_eq!(conversation.command(nobody), Outcome::Unknown);
     assert_eq!(conversation.command(Action::AcknowledgeAll { node: Some(NodeIndex(7)) }), Outcome::Unknown);
-    assert_eq!(conversation.command(Action::Acknowledge { alarm: AlarmIndex(9_999) }), Outcome::Unknown);
+    assert_eq!(
+        conversation.command(Action::Acknowledge { alarm: AlarmIndex(9_999), raise: None }),
+        Outcome::Unknown
+    );
     assert_eq!(conversation.command(Action::Reset { alarm: AlarmIndex(9_999) }), Outcome::Unknown);
     conversation.link(Link::Down);
     assert_eq!(conversation.nmt(NmtRequest::Stop), Outcome::NodeUnavailable);
     conversation.end();
+}
+
+#[test]
+fn who_asks_again_and_again_for_what_is_refused_does_not_fill_the_journal() {
+    let mut conversation = running(detcon_with(|bus, _| bus.role = RoleWord::Passive));
+    for second in 2..=302 {
+        conversation.run_to(second * 1000);
+        assert!(matches!(conversation.nmt(NmtRequest::Stop), Outcome::Rejected(_)));
+    }
+    let commands = conversation.events().into_iter().filter(|event| event.kind == EventKind::Command);
+    let texts: Vec<String> = commands.map(|event| event.text).collect();
+    assert_eq!(texts.len(), 6, "the first, and a count each minute: {texts:#?}");
+    assert!(texts[0].starts_with("stop: ") && !texts[0].contains("more of these"), "{}", texts[0]);
+    assert!(texts[5].starts_with("60 more of these within 60 s, the last: stop: "), "{}", texts[5]);
 }
 
 #[test]

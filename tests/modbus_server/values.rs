@@ -1,6 +1,6 @@
 //! What the registers and bits show.
 
-use cangate::mapping::{OnLoss, TagTable};
+use cangate::mapping::{OnLoss, Protocol, TagTable};
 use cangate::modbus::map_text::{MapFormat, render};
 use cangate::modbus::{ModbusSettings, RegisterBank, RegisterMap, WordOrder};
 use cangate::process_image::{
@@ -375,7 +375,8 @@ fn a_node_that_is_not_online_drops_out_of_its_bitmap() {
 fn node_ids_stand_in_the_bitmaps_from_1_to_127_and_two_of_one_id_need_both() {
     let mut table = table();
     for (node, id) in [(0, 127), (1, 16), (2, 1), (3, 1)] {
-        table.nodes[node].canopen.id = cangate::canopen::NodeId::new(id).unwrap();
+        let Protocol::Canopen(settings) = &mut table.nodes[node].protocol else { panic!("a CANopen node") };
+        settings.id = cangate::canopen::NodeId::new(id).unwrap();
     }
     let mut image = plant::image(&table);
     let bank = bank(table, &ModbusSettings::default());

@@ -19,6 +19,7 @@ use std::sync::Arc;
 
 use cangate::can::{BusEvent, BusIndex, CanFrame, Link};
 use cangate::canopen::NmtRequest;
+use cangate::gateway::kept::Kept;
 use cangate::gateway::{Action, Command, CommandSource, Gateway, Health, Input, Outcome, Output};
 use cangate::mapping::{AlarmOwner, TagTable};
 use cangate::process_image::{
@@ -93,6 +94,8 @@ impl Conversation {
             }
         }
         self.gateway.publish(&mut self.image);
+        let blocked: u64 = self.image.buses.iter().map(|bus| bus.frames_blocked).sum();
+        assert_eq!(blocked, 0, "the gateway made a frame that the configuration does not allow");
     }
 
     fn reply_to_guarding(&mut self, request: CanFrame) {
@@ -193,6 +196,19 @@ impl Conversation {
         self.bus_event(BusEvent::Frame { frame, at: self.moment() });
     }
 
+    /// The gateway goes on with another table; its interfaces stay.
+    pub fn exchange(&mut self, table: TagTable) {
+        let table = Arc::new(table);
+        let kept = Kept::new(&self.table, &table, |_, _| true);
+        let now = self.moment();
+        self.gateway.prepare_exchange(now, &table, &kept);
+        self.drain();
+        let old = std::mem::replace(&mut self.gateway, Gateway::new(Arc::default(), now));
+        (self.gateway, self.image) = old.exchange(Arc::clone(&table), &kept, now, &self.image);
+        self.table = table;
+        self.drain();
+    }
+
     pub fn link(&mut self, link: Link) {
         self.bus_event(BusEvent::Link { link, at: self.moment() });
     }
@@ -202,9 +218,26 @@ impl Conversation {
     }
 
     pub fn command(&mut self, action: Action) -> Outcome {
-        let source = CommandSource::Mqtt("test".into());
+        let source = CommandSource::mqtt("test".into());
         self.input(Input::Command(Command { id: 1, source, action }));
         self.outcomes.pop().expect("every command is answered at once")
+    }
+
+    /// Asks for something; the answer may come later.
+    pub fn ask(&mut self, action: Action) {
+        let source = CommandSource::mqtt("test".into());
+        self.input(Input::Command(Command { id: 1, source, action }));
+    }
+
+    /// All answers so far, in words.
+    pub fn outcome_words(&self) -> Vec<String> {
+        self.outcomes.iter().map(|outcome| format!("{outcome:?}")).collect()
+    }
+
+    /// When a guard request was sent, in ms.
+    pub fn guard_requests_of(&self, frame: &str) -> Vec<u64> {
+        let of = self.guard_requests.iter().filter(|(_, sent)| sent == frame);
+        of.map(|(at, _)| at.as_millis()).collect()
     }
 
     pub fn nmt(&mut self, request: NmtRequest) -> Outcome {

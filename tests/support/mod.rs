@@ -1,9 +1,16 @@
 //! What several tests need.
 pub mod conversation;
 pub mod fake_broker;
+pub mod http;
+pub mod lines;
 pub mod modbus;
+pub mod mosquitto;
+pub mod mqtt_client;
+pub mod pki;
 pub mod plant;
 pub mod registers;
+pub mod secure_modbus;
+pub mod secure_web;
 
 use std::time::Duration;
 

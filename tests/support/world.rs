@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use cangate::can::{BusEvent, BusIndex, CanFrame, Link};
 use cangate::canopen::NodeId;
+use cangate::gateway::kept::Kept;
 use cangate::gateway::{Action, Command, CommandSource, Gateway, Input, Outcome, Output};
 use cangate::mapping::{Sketch, Source, TagTable};
 use cangate::process_image::{NodeIndex, NodeStatus, ProcessImage, Quality, Sample};
@@ -130,6 +131,31 @@ impl World {
         let event = BusEvent::Link { link: Link::ErrorActive, at: self.now() };
         gateway.handle_input(self.now(), Input::Bus { bus: BUS, event });
         self.gateway = Some(gateway);
+        self.settle();
+    }
+
+    /// The gateway stops in order; what it says last leaves.
+    pub fn stop_gateway(&mut self) {
+        let now = self.now();
+        self.gateway.as_mut().expect("a gateway").handle_stop(now);
+        self.settle();
+        self.gateway = None;
+    }
+
+    /// The gateway is gone from one moment to the next.
+    pub fn crash_gateway(&mut self) {
+        self.gateway = None;
+    }
+
+    /// The gateway goes on with another table; its interfaces stay.
+    pub fn exchange(&mut self, table: Arc<TagTable>) {
+        let kept = Kept::new(&self.table, &table, |_, _| true);
+        let now = self.now();
+        self.gateway.as_mut().expect("a gateway").prepare_exchange(now, &table, &kept);
+        self.settle();
+        let old = self.gateway.take().expect("a gateway");
+        let (gateway, image) = old.exchange(Arc::clone(&table), &kept, now, &self.image);
+        (self.gateway, self.image, self.table) = (Some(gateway), image, table);
         self.settle();
     }
 
@@ -261,6 +287,7 @@ impl World {
             }
         }
         gateway.publish(&mut self.image);
+        assert!(self.image.buses.iter().all(|bus| bus.frames_blocked == 0), "a frame that is not allowed");
         self.gateway = Some(gateway);
         if self.image.journal.newest() != self.cursor {
             let (events, _) = self.image.journal.after(self.cursor);
@@ -299,7 +326,7 @@ impl World {
     /// Asks the gateway for something; gives the number of the request.
     pub fn command(&mut self, action: Action) -> u64 {
         self.commands += 1;
-        let source = CommandSource::Cia309("test".into());
+        let source = CommandSource::cia309("test".into());
         let (id, now) = (self.commands, self.now());
         let command = Command { id, source, action };
         self.gateway.as_mut().expect("a gateway").handle_input(now, Input::Command(command));

@@ -281,8 +281,16 @@ fn python_canopen_as_a_second_client_of_a_transmitter_is_never_told_a_lie_and_di
     let broker = Broker::start();
     let subscriber = Subscriber::start(&broker, TOPICS);
     let _press = simulate("dst-p92c", 5, &[]);
-    let fast =
-        cangate::mapping::shipped("danfoss-dst-p92c").unwrap().replace("poll_ms = 1000", "poll_ms = 100");
+    // The long time-out: that the guest stalls for seconds is not the other client's doing.
+    let fast = [
+        ("poll_ms = 1000", "poll_ms = 100"),
+        ("heartbeat_timeout_ms = 3000", "heartbeat_timeout_ms = 30000"),
+    ]
+    .iter()
+    .fold(cangate::mapping::shipped("danfoss-dst-p92c").unwrap().to_owned(), |mapping, (from, to)| {
+        assert!(mapping.contains(from), "{from}");
+        mapping.replace(from, to)
+    });
     let gateway =
         Setup::detcons(&[]).broker(&broker).mapping("press", &fast).node("press", 5, "press").start();
     let good = || {

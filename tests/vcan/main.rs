@@ -11,11 +11,16 @@
 //! | `silence` | which frames the gateway ever sends, also when it is stopped or killed; the passive role |
 //! | `faults` | interface down, deleted, bus-off; a full bus |
 //! | `broker` | a broker that is killed again and again |
+//! | `link` | a network that loses every packet for a while |
+//! | `outage` | sixteen engines, a broker that is away for long, a gateway that is killed again and again |
 //! | `socket` | the bus room alone: link states, lost frames, full queues, receive times |
 //! | `many` | two devices, two clients, a second master |
 //! | `commissioning` | scan, init, nmt, sdo: what they send, and that a scan sends nothing |
 //! | `transmitter` | a DST P92C from its box to its values: clash, LSS, configuration, EMCY, loss, no needless write |
+//! | `secure` | Modbus/TCP Security with pymodbus, by certificates made as docs/security.md says |
+//! | `serial` | the lines of a CAN-CBM-SIO4: data each way on all, by TCP, pty and MQTT; resets, watchdog, suspend, a dead bus |
 //! | `foreign` | python-canopen as a device known by its EDS alone, as judge of SDO transfers, as a second client |
+//! | `sparkplug` | a foreign host (pysparkplug) decodes and judges every message: births, deaths, rebirth, sequence, history |
 //! | `namespace` | a gateway that reaches the bus from a network namespace of its own, as in a container |
 //!
 //! vcan0 is there once, so the tests run one after another; each begins with a new interface.
@@ -48,10 +53,15 @@ mod foreign;
 mod guarding;
 mod harness;
 mod harness_itself;
+mod link;
 mod many;
 mod namespace;
+mod outage;
 mod pulse;
+mod secure;
+mod serial;
 mod silence;
 mod socket;
+mod sparkplug;
 mod start;
 mod transmitter;

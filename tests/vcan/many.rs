@@ -1,11 +1,15 @@
 //! Two devices, two kinds of client, a second master.
 
 use std::collections::BTreeSet;
+use std::process::Command;
+
+use tempfile::TempDir;
 
 use crate::harness::broker::{Broker, Subscriber};
 use crate::harness::bus::{Capture, cansend, take_the_bus};
 use crate::harness::gateway::{Setup, TOPICS, simulator};
-use crate::harness::modbus::{Table, mbpoll, pymodbus, pymodbus_identification};
+use crate::harness::modbus::{Table, mbpoll, mbpoll_rtu, pymodbus, pymodbus_identification};
+use crate::harness::process::Process;
 use crate::harness::wait::wait_until;
 
 #[test]
@@ -104,4 +108,31 @@ fn mbpoll_and_pymodbus_read_every_published_block() {
             .zip(&raw)
             .all(|(scaled, raw)| (u32::from(*raw) * 10000 + 127) / 255 == u32::from(*scaled))
     });
+}
+
+#[test]
+fn mbpoll_reads_the_same_registers_on_a_serial_line_and_of_other_units_nothing() {
+    let _bus = take_the_bus();
+    let _device = simulator(1, &[]);
+    let folder = TempDir::new().unwrap();
+    let [ours, theirs] = ["ours", "theirs"].map(|end| folder.path().join(end).display().to_string());
+    let gateway = Setup::one_detcon().more(&format!("[[modbus.rtu]]\ndevice = \"{ours}\"")).start();
+    gateway.node(1).wait_for_status("good data", |status| status.all_good());
+    // The port appears after the gateway has started: it is tried again.
+    let end = |path: &str| format!("pty,raw,echo=0,link={path}");
+    let mut cable = Process::start("socat", Command::new("socat").args([end(&ours), end(&theirs)]));
+    wait_until("an answer on the line", || mbpoll_rtu(&theirs, 247, Table::Input, 90, 1) == Ok(vec![0x1234]));
+    for (table, address, count) in
+        [(Table::Input, 200, 46), (Table::Holding, 120, 3), (Table::Discrete, 32, 20)]
+    {
+        let by_line = mbpoll_rtu(&theirs, 1, table, address, count).unwrap();
+        assert_eq!(by_line.len(), usize::from(count));
+        assert_eq!(by_line, mbpoll(gateway.modbus, 1, table, address, count).unwrap());
+    }
+    let silent = mbpoll_rtu(&theirs, 9, Table::Input, 0, 1).unwrap_err();
+    assert!(silent.contains("timed out"), "{silent}");
+    // An adapter that is unplugged and plugged in again.
+    cable.kill();
+    let _cable = Process::start("socat", Command::new("socat").args([end(&ours), end(&theirs)]));
+    wait_until("an answer again", || mbpoll_rtu(&theirs, 247, Table::Input, 90, 1) == Ok(vec![0x1234]));
 }

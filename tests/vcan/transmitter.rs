@@ -365,10 +365,13 @@ fn a_transmitter_with_the_node_id_of_a_detcon_is_moved_configured_read_and_watch
     let begin = capture.mark();
     give_it(Duration::from_secs(5));
     let timed = capture.timed();
+    // The median: a guest that stalls is not the device's doing.
     let period = |id: &str| {
         let seen: Vec<f64> =
             timed[begin..].iter().filter(|(_, frame)| frame.starts_with(id)).map(|(at, _)| *at).collect();
-        (seen[seen.len() - 1] - seen[0]) / f64::from(u32::try_from(seen.len() - 1).unwrap())
+        let mut gaps: Vec<f64> = seen.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        gaps.sort_by(f64::total_cmp);
+        gaps[gaps.len() / 2]
     };
     println!("TPDO1 every {:.1} ms, heartbeat every {:.1} ms", period("185#") * 1e3, period("705#") * 1e3);
     assert!((0.09..0.15).contains(&period("185#")) && (0.45..0.7).contains(&period("705#")));

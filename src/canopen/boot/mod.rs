@@ -202,8 +202,9 @@ impl Boot {
 
     /// Nothing can be asked now, and that is nobody's fault.
     pub(super) fn postpone(&mut self, now: Instant) {
-        if self.phase == Phase::Running {
+        if self.is_under_way() {
             self.task = None;
+            self.held = None;
             self.phase = Phase::Waiting(now + self.settings.retry);
         }
     }

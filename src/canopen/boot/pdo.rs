@@ -9,13 +9,12 @@
 
 use super::task::{Advance, Answer};
 use super::{BootEvent, BootFailure, MappedPdo, MappingMode, PdoSetup};
-use crate::can::CanId;
+use crate::canopen::cob_id;
 use crate::canopen::object::{MappedObject, ObjectId};
 use crate::canopen::sdo::{SdoError, SdoRequest};
 
-/// Bits of a COB-ID in 0x1800:1.
+/// The bit of a COB-ID in 0x1800:1 of a PDO that is not sent.
 const NOT_VALID: u32 = 1 << 31;
-const EXTENDED: u32 = 1 << 29;
 /// A mapping has at most so many entries; beyond are multiplexed PDOs.
 const MOST_ENTRIES: u8 = 64;
 
@@ -236,14 +235,9 @@ impl PdoTask {
     fn tell(&mut self) -> Advance {
         self.phase = Phase::Told;
         let found = &mut self.found;
-        let cob_id = if found.cob_id & EXTENDED == 0 {
-            u16::try_from(found.cob_id & 0x7FF).ok().and_then(CanId::standard)
-        } else {
-            CanId::extended(found.cob_id & 0x1FFF_FFFF)
-        };
         let mapped = MappedPdo {
             pdo: self.setup.pdo,
-            cob_id: cob_id.filter(|_| found.cob_id & NOT_VALID == 0),
+            cob_id: cob_id::in_use(found.cob_id),
             maps: std::mem::take(&mut found.maps),
             transmission_type: found.transmission_type,
             event_timer: found.event_timer.unwrap_or_default(),

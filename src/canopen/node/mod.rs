@@ -33,6 +33,9 @@ use watch::Watch;
 /// A boot-up message this long after an ordered reset was ordered too; slow devices take seconds.
 const RESET_TAKES: Duration = Duration::from_secs(30);
 
+/// What a node sent before a command of ours reached it comes within this time.
+const ON_ITS_WAY: Duration = Duration::from_millis(20);
+
 /// One node.
 #[derive(Debug)]
 pub(super) struct Node {
@@ -43,8 +46,10 @@ pub(super) struct Node {
     pub(super) sdo: Option<SdoClient>,
     pub(super) boot: Boot,
     pub(super) polls: Polls,
-    /// TPDOs of which the node has told another identifier.
-    moved: Vec<(PdoIndex, Option<CanId>)>,
+    /// What the node has told to send with other identifiers; `None`: not at all.
+    moved: Vec<(Moved, Option<CanId>)>,
+    /// The identifier of its emergency messages, unless it tells another.
+    emergency: CanId,
     pub(super) pdos: Pdos,
     rpdos: Rpdos,
     /// A frame of it came since the bus can be used.
@@ -55,12 +60,17 @@ pub(super) struct Node {
     pub(super) self_starting: bool,
     /// The believed state; `None` before the first sign.
     pub(super) state: Option<NmtState>,
+    /// Another master ordered it out of operation, and it has told no state since.
+    told_to_leave: bool,
     /// Where the last NMT command leads, until the node goes elsewhere.
     pub(super) ordered: Option<NmtState>,
     /// What `ordered` was before the last command of ours, and whether the node was held.
     before: Option<(Option<NmtState>, bool)>,
     /// It was taken out of operation to be configured, and starts by nobody's command: that is given back.
     taken_out: bool,
+    /// It was put into pre-operational and has told no state since: until when what it sends was on its way before, and
+    /// the state before.
+    entered: Option<(Instant, Option<NmtState>)>,
     /// Until then a boot-up message is the effect of an ordered reset.
     pub(super) reset_until: Option<Instant>,
     /// Undefined state code that was told last.
@@ -82,6 +92,15 @@ pub(super) struct Node {
     never_seen_after: Duration,
     never_seen_at: Option<Instant>,
     never_seen_told: bool,
+}
+
+/// What a node can send with another identifier than was thought.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Moved {
+    /// One of its TPDOs.
+    Pdo(PdoIndex),
+    /// Its emergency messages.
+    Emergency,
 }
 
 /// Why an SDO transfer was not begun.
@@ -116,6 +135,7 @@ impl Node {
             boot,
             polls: Polls::new(settings.polls),
             moved: Vec::new(),
+            emergency: settings.emergency.unwrap_or_else(|| cob_id::emcy(settings.id)),
             duplicate: Duplicate::new(&settings.pdos),
             strange: Strange::default(),
             pdos: Pdos::new(settings.pdos),
@@ -125,6 +145,8 @@ impl Node {
             ordered: None,
             before: None,
             taken_out: false,
+            told_to_leave: false,
+            entered: None,
             reset_until: None,
             invalid: None,
             unsolicited_told: false,
@@ -204,6 +226,7 @@ impl Node {
         });
         match request {
             NmtRequest::Start => {
+                self.told_to_leave = false;
                 self.duplicate.handle_start();
                 if !self.watch.is_lost() {
                     self.pdos.supervise(now);
@@ -228,7 +251,17 @@ impl Node {
     }
 
     /// A command of ours to this node did not leave: as if it had not been given.
-    pub(super) fn command_not_sent(&mut self, now: Instant, request: NmtRequest) {
+    pub(super) fn command_not_sent(&mut self, now: Instant, request: NmtRequest, outputs: &mut Outputs) {
+        if request == NmtRequest::EnterPreOperational
+            && let Some((_, state)) = self.entered.take()
+        {
+            match state {
+                Some(state) => self.set_state(state, true, outputs),
+                None => self.state = None,
+            }
+            self.boot.handle_state(true);
+            self.boot.postpone(now);
+        }
         if let Some((ordered, held)) = self.before.take() {
             self.ordered = ordered;
             if let Some(start) = self.start.as_mut().filter(|start| start.is_held() && !held) {

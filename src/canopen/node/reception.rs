@@ -81,7 +81,7 @@ impl Node {
         if let Some(guarding) = self.watch.guarding() {
             guarding.ask_after_boot_up(now);
         }
-        self.duplicate.handle_boot_up(now, self.self_starting);
+        self.duplicate.handle_boot_up(now, self.self_starting || self.boot.is_self_starting());
         self.strange = Strange::default();
         let expected = self.reset_until.take().is_some_and(|until| now <= until);
         if single && !reply {
@@ -207,6 +207,9 @@ impl Node {
             return false;
         };
         self.invalid = None;
+        if state == NmtState::Operational && self.was_on_its_way(now) {
+            return false;
+        }
         self.set_state(state, self.is_ordered(state), outputs);
         match state {
             NmtState::Operational => {
@@ -234,7 +237,9 @@ impl Node {
         }
     }
 
-    fn set_state(&mut self, to: NmtState, ordered: bool, outputs: &mut Outputs) {
+    pub(super) fn set_state(&mut self, to: NmtState, ordered: bool, outputs: &mut Outputs) {
+        self.entered = None;
+        self.told_to_leave = false;
         let from = self.state.replace(to);
         self.boot.handle_state(match to {
             NmtState::Initialising => self.self_starting || self.boot.is_self_starting(),
@@ -258,17 +263,17 @@ impl Node {
         }
     }
 
-    /// A frame on the identifier of a TPDO.
+    /// A frame on the identifier of a TPDO. Whether it counts as one.
     pub(in crate::canopen) fn handle_pdo(
         &mut self,
         now: Instant,
         pdo: PdoIndex,
         frame: &CanFrame,
         outputs: &mut Outputs,
-    ) {
+    ) -> bool {
         if frame.is_remote() {
             outputs.node(self.id, NodeEvent::Malformed { frame: *frame });
-            return;
+            return false;
         }
         self.frame_seen(now, outputs);
         let received = frame.dlc();
@@ -288,8 +293,8 @@ impl Node {
         if length != Some(Length::Right) {
             outputs.node(self.id, NodeEvent::PdoLength { pdo, received, discarded });
         }
-        if discarded {
-            return;
+        if discarded || self.was_on_its_way(now) {
+            return false;
         }
         let evidence = self.duplicate.handle_pdo(now, pdo);
         self.suspect(evidence, outputs);
@@ -299,6 +304,12 @@ impl Node {
             *to = *from;
         }
         outputs.node(self.id, NodeEvent::Pdo { pdo, data, length: received });
+        true
+    }
+
+    /// Whether the node may have sent what comes now before it was put into pre-operational, a moment ago.
+    fn was_on_its_way(&self, now: Instant) -> bool {
+        self.entered.is_some_and(|(until, _)| now < until)
     }
 
     /// Only an operational node sends TPDOs, so it is believed to be one until it reports its state (R-DET-083).
@@ -383,7 +394,7 @@ impl Node {
     }
 
     /// Another master's command to this node was overheard. Its effect is believed in the passive role, which has no
-    /// other way to learn of it; a master asks the node instead.
+    /// other way to learn of it; a master asks the node instead, and sends it no RPDOs before it has answered.
     pub(in crate::canopen) fn handle_foreign_command(
         &mut self,
         now: Instant,
@@ -391,6 +402,7 @@ impl Node {
         outputs: &mut Outputs,
     ) {
         if self.start.is_some() {
+            self.told_to_leave = request != NmtRequest::Start;
             if request == NmtRequest::Start {
                 self.duplicate.handle_start();
             }

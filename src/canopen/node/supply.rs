@@ -88,6 +88,7 @@ impl Node {
             && self.heard
             && watched
             && stays
+            && !self.told_to_leave
             && !self.watch.is_lost()
             && self.boot.is_done()
     }

@@ -7,13 +7,16 @@ use super::super::network::FOREIGN_QUIET;
 use super::super::object::ObjectId;
 use super::super::outputs::Outputs;
 use super::super::polls::Polls;
-use super::super::sdo::{SdoClient, SdoError, SdoOutput, SdoRequest, TransferId};
+use super::super::sdo::{Refused, SdoClient, SdoError, SdoOutput, SdoRequest, TransferId};
 use super::super::start::Start;
-use super::super::{NmtRequest, NmtState, NodeEvent, PdoIndex, RpdoIndex};
+use super::super::{NmtRequest, NmtState, NodeEvent, RpdoIndex, cob_id};
 use super::watch::Watch;
-use super::{Node, SdoRefused};
+use super::{Moved, Node, ON_ITS_WAY, SdoRefused};
 use crate::can::{CanFrame, CanId};
 use crate::time::Instant;
+
+/// The identifier of emergency messages.
+const EMERGENCY_ID: ObjectId = ObjectId::new(0x1014, 0);
 
 impl Node {
     /// Asks for a transfer.
@@ -49,12 +52,14 @@ impl Node {
             (2, _) | (5, 0) => false,
             _ => return,
         };
+        let object = ObjectId::new(u16::from_le_bytes([low, high]), sub);
         let told = !write && self.foreign_read.is_some_and(|last| now.since(last) <= FOREIGN_QUIET);
-        if !write {
+        if write {
+            self.polls.handle_write(now, object);
+        } else {
             self.foreign_read = Some(now);
         }
         if !told {
-            let object = ObjectId::new(u16::from_le_bytes([low, high]), sub);
             outputs.node(self.id, NodeEvent::ForeignSdo { object, write });
         }
     }
@@ -66,8 +71,8 @@ impl Node {
         }
     }
 
-    /// TPDOs that have another identifier than before; `None`: they are switched off.
-    pub(in crate::canopen) fn take_moved(&mut self) -> Vec<(PdoIndex, Option<CanId>)> {
+    /// What has another identifier than before; `None`: it is switched off.
+    pub(in crate::canopen) fn take_moved(&mut self) -> Vec<(Moved, Option<CanId>)> {
         std::mem::take(&mut self.moved)
     }
 
@@ -100,16 +105,23 @@ impl Node {
         }
     }
 
-    /// Reads the next object that is due. A stopped node answers no SDO (R-DST-071): that reading has failed.
+    /// Reads the next object that is due. A stopped node answers no SDO (R-DST-071): that reading has failed. Where others
+    /// ask for so much that there is no room, it waits a little.
     pub(super) fn poll(&mut self, now: Instant, outputs: &mut Outputs) {
         let Some((id, request)) = self.polls.handle_timeout(now) else { return };
-        let taken = self.state != Some(NmtState::Stopped)
-            && self.sdo.as_mut().is_some_and(|sdo| sdo.request(now, id, request).is_ok());
-        if taken {
-            self.transfer(now, outputs);
-        } else if let Some(poll) = self.polls.handle_sdo(id) {
-            let result = Err(SdoError::BusUnavailable);
-            outputs.node(self.id, NodeEvent::Polled { poll, result });
+        let sdo = self.sdo.as_mut().filter(|_| self.state != Some(NmtState::Stopped));
+        match sdo.map(|sdo| sdo.request(now, id, request)) {
+            Some(Ok(())) => {
+                self.polls.handle_taken();
+                self.transfer(now, outputs);
+            }
+            Some(Err(Refused::QueueFull { .. })) if self.polls.postpone(now) => {}
+            Some(Err(_)) | None => {
+                if let Some(poll) = self.polls.handle_sdo(id) {
+                    let result = Err(SdoError::BusUnavailable);
+                    outputs.node(self.id, NodeEvent::Polled { poll, result });
+                }
+            }
         }
     }
 
@@ -140,6 +152,9 @@ impl Node {
                     }
                 } else if let BootEvent::Mapped(mapped) = &event {
                     self.mapped(mapped);
+                }
+                if let BootEvent::Object { object: EMERGENCY_ID, data } = &event {
+                    self.emergency_id(data.as_deref());
                 }
                 if let BootEvent::RpdoMapped(mapped) = &event {
                     self.rpdo_mapped(now, RpdoIndex(mapped.pdo.0), mapped.cob_id, &mapped.maps);
@@ -180,23 +195,32 @@ impl Node {
     /// The node said how it sends a TPDO.
     fn mapped(&mut self, mapped: &MappedPdo) {
         self.pdos.set_length(mapped.pdo, mapped.length());
-        self.moved.push((mapped.pdo, mapped.cob_id));
+        self.moved.push((Moved::Pdo(mapped.pdo), mapped.cob_id));
         if let Some(timed) = self.boot.adopts(mapped.pdo) {
             if timed {
                 self.pdos.set_timeout(mapped.pdo, mapped.timeout());
             }
-            let sent = mapped.maps.iter().filter(|_| mapped.cob_id.is_some());
-            self.polls.carry(sent.map(|mapped| mapped.object));
+            if mapped.cob_id.is_some() {
+                self.polls.carry(&mapped.maps);
+            }
         }
     }
 
-    /// So that its configuration can be changed; it is started when that is done.
+    /// The node said which identifier its emergency messages have, or would not tell (R-DST-119).
+    fn emergency_id(&mut self, data: Option<&[u8]>) {
+        let told = data.and_then(|data| <[u8; 4]>::try_from(data).ok()).map(u32::from_le_bytes);
+        self.moved.push((Moved::Emergency, told.map_or(Some(self.emergency), cob_id::in_use)));
+    }
+
+    /// So that its configuration can be changed; it is started when that is done. One whose state is not known may run.
     fn enter_pre_operational(&mut self, now: Instant, outputs: &mut Outputs) {
         let request = NmtRequest::EnterPreOperational;
-        self.taken_out |= self.state == Some(NmtState::Operational) || self.boot.is_self_starting();
+        let before = self.state;
+        self.taken_out |=
+            matches!(before, None | Some(NmtState::Operational)) || self.boot.is_self_starting();
         outputs.transmit(request.frame(Some(self.id)));
         self.note_sent(now, request, outputs);
-        self.state = Some(NmtState::PreOperational);
-        self.boot.handle_state(false);
+        self.set_state(NmtState::PreOperational, true, outputs);
+        self.entered = Some((now + ON_ITS_WAY, before));
     }
 }

@@ -1,240 +1,12 @@
 //! A node that is configured before it is started, against a device in the form of a table of objects.
 
-use std::collections::BTreeMap;
-use std::time::Duration;
-
-use super::bench::{detcon, master};
-use crate::can::{CanFrame, CanId};
-use crate::canopen::boot::{BootEvent, BootFailure, BootSettings, BootStep, MappingMode, PdoSetup};
-use crate::canopen::object::{MappedObject, ObjectId};
-use crate::canopen::polls::Poll;
-use crate::canopen::sdo::SdoSettings;
-use crate::canopen::{
-    ErrorControl, Network, NetworkOutput, NmtRequest, NmtState, NodeEvent, NodeId, NodeSettings, PdoIndex,
-    PdoSettings, RpdoIndex, RpdoSettings, RpdoTrigger,
-};
+use super::boot_plant::*;
+use crate::can::CanId;
+use crate::canopen::boot::{BootEvent, BootFailure, BootStep, MappingMode, PdoSetup};
+use crate::canopen::object::MappedObject;
+use crate::canopen::sdo::{SdoRequest, TransferId};
+use crate::canopen::{NetworkOutput, NmtRequest, NmtState, NodeEvent, NodeId, PdoIndex, RpdoIndex};
 use crate::time::Now;
-
-const fn object(index: u16, sub: u8) -> ObjectId {
-    ObjectId::new(index, sub)
-}
-
-/// A device of the kind of DST P92C: expedited SDO, heartbeat every 500 ms once its producer time is set, one TPDO.
-struct Device {
-    objects: BTreeMap<ObjectId, Vec<u8>>,
-    state: NmtState,
-    /// Objects in the order in which they were written, and the state in which.
-    writes: Vec<(ObjectId, NmtState)>,
-    refuse: Option<(ObjectId, u32)>,
-    mute: bool,
-}
-
-impl Device {
-    fn new() -> Self {
-        let objects = [
-            (object(0x1000, 0), 0x0002_0194_u32.to_le_bytes().to_vec()),
-            (object(0x1010, 1), 1_u32.to_le_bytes().to_vec()),
-            (object(0x1017, 0), 0_u16.to_le_bytes().to_vec()),
-            (object(0x1018, 1), 0x23D_u32.to_le_bytes().to_vec()),
-            (object(0x1800, 1), 0x181_u32.to_le_bytes().to_vec()),
-            (object(0x1800, 2), vec![1]),
-            (object(0x1800, 3), vec![0, 0]),
-            (object(0x1800, 5), 1000_u16.to_le_bytes().to_vec()),
-            (object(0x1A00, 0), vec![2]),
-            (object(0x1A00, 1), 0x9130_0120_u32.to_le_bytes().to_vec()),
-            (object(0x1A00, 2), 0x6150_0108_u32.to_le_bytes().to_vec()),
-            (object(0x6131, 1), 0x0022_0000_u32.to_le_bytes().to_vec()),
-        ];
-        Self {
-            objects: objects.into_iter().collect(),
-            state: NmtState::PreOperational,
-            writes: Vec::new(),
-            refuse: None,
-            mute: false,
-        }
-    }
-
-    fn answer(&mut self, request: &CanFrame) -> Option<CanFrame> {
-        let reply = |data: [u8; 8]| CanFrame::data_frame(CanId::Standard(0x581), &data);
-        if request.id() == CanId::Standard(0) {
-            self.state = match request.data()[0] {
-                1 => NmtState::Operational,
-                2 => NmtState::Stopped,
-                _ => NmtState::PreOperational,
-            };
-            return None;
-        }
-        if self.mute || request.id() != CanId::Standard(0x601) {
-            return None;
-        }
-        assert_ne!(self.state, NmtState::Stopped, "{request}: a stopped node takes no SDO requests");
-        let data: [u8; 8] = request.data().try_into().unwrap();
-        let (low, high, sub) = (data[1], data[2], data[3]);
-        let object = ObjectId::new(u16::from_le_bytes([low, high]), sub);
-        if let Some((refused, code)) = self.refuse
-            && refused == object
-            && data[0] != 0x40
-        {
-            let [a, b, c, d] = code.to_le_bytes();
-            return reply([0x80, low, high, sub, a, b, c, d]);
-        }
-        if data[0] == 0x40 {
-            let Some(value) = self.objects.get(&object) else {
-                return reply([0x80, low, high, sub, 0, 0, 2, 6]);
-            };
-            let mut answer = [0x43 | u8::try_from(4 - value.len()).unwrap() << 2, low, high, sub, 0, 0, 0, 0];
-            answer[4..4 + value.len()].copy_from_slice(value);
-            return reply(answer);
-        }
-        let length = 4 - usize::from(data[0] >> 2 & 3);
-        self.objects.insert(object, data[4..4 + length].to_vec());
-        self.writes.push((object, self.state));
-        reply([0x60, low, high, sub, 0, 0, 0, 0])
-    }
-}
-
-struct Plant {
-    network: Network,
-    device: Device,
-    now: u64,
-    told: Vec<BootEvent>,
-    begun: u32,
-    /// Of each reading of the polled object whether it succeeded.
-    polled: Vec<bool>,
-    nmt: Vec<String>,
-    /// When RPDOs were sent.
-    rpdos: Vec<u64>,
-}
-
-fn setup(mode: MappingMode, set_invalid: bool) -> PdoSetup {
-    let maps = [0x6130_0120, 0x9130_0220].map(MappedObject::from_entry).to_vec();
-    PdoSetup {
-        pdo: PdoIndex(0),
-        number: 1,
-        mode,
-        maps,
-        transmission_type: Some(255),
-        inhibit_time: None,
-        event_timer: Some(100),
-        set_invalid,
-    }
-}
-
-fn steps() -> Vec<BootStep> {
-    vec![
-        BootStep::Identity { object: object(0x1000, 0), expected: 0x0002_0194, tolerated: false },
-        BootStep::Identity { object: object(0x1018, 1), expected: 0x23D, tolerated: false },
-        BootStep::Write { object: object(0x1017, 0), data: 500_u16.to_le_bytes().to_vec(), optional: false },
-        BootStep::Pdo(setup(MappingMode::Write, false)),
-        BootStep::Read { object: object(0x6131, 1) },
-        BootStep::Save,
-    ]
-}
-
-impl Plant {
-    fn new(steps: Vec<BootStep>) -> Self {
-        let node = NodeSettings {
-            error_control: ErrorControl::Heartbeat { timeout: Duration::from_millis(1500) },
-            sdo: Some(SdoSettings::default()),
-            boot: BootSettings { steps, ..BootSettings::default() },
-            polls: vec![Poll {
-                object: object(0x6131, 1),
-                period: Duration::from_secs(1),
-                length: 4,
-                read_by_boot: false,
-            }],
-            pdos: vec![PdoSettings {
-                number: 1,
-                cob_id: CanId::Standard(0x181),
-                length: 8,
-                strict_length: false,
-                timeout: None,
-                synchronous: false,
-                shortest_period: None,
-            }],
-            rpdos: vec![RpdoSettings {
-                number: 1,
-                cob_id: CanId::Standard(0x201),
-                length: 2,
-                trigger: RpdoTrigger::Event,
-                refresh: Some(Duration::from_secs(1)),
-                inhibit: Duration::ZERO,
-            }],
-            ..detcon(1)
-        };
-        let network = Network::new(master(vec![node]), Now::from_millis(0));
-        Self {
-            network,
-            device: Device::new(),
-            now: 0,
-            told: Vec::new(),
-            begun: 0,
-            polled: Vec::new(),
-            nmt: Vec::new(),
-            rpdos: Vec::new(),
-        }
-    }
-
-    fn drain(&mut self) {
-        while let Some(output) = self.network.poll_output() {
-            match output {
-                NetworkOutput::Transmit(frame) => {
-                    if frame.id() == CanId::Standard(0) {
-                        self.nmt.push(frame.to_string());
-                        self.device.answer(&frame);
-                        let state = [self.device.state.code()];
-                        let heartbeat = CanFrame::data_frame(CanId::Standard(0x701), &state).unwrap();
-                        self.network.handle_frame(Now::from_millis(self.now), &heartbeat);
-                    }
-                    if frame.id() == CanId::Standard(0x201) {
-                        self.rpdos.push(self.now);
-                    }
-                    if let Some(answer) = self.device.answer(&frame) {
-                        self.network.handle_frame(Now::from_millis(self.now), &answer);
-                    }
-                }
-                NetworkOutput::Node(_, NodeEvent::Boot(BootEvent::Begun)) => self.begun += 1,
-                NetworkOutput::Node(_, NodeEvent::Boot(event)) => self.told.push(event),
-                NetworkOutput::Node(_, NodeEvent::Polled { result, .. }) => self.polled.push(result.is_ok()),
-                NetworkOutput::Node(..) | NetworkOutput::Foreign(_) => {}
-            }
-        }
-    }
-
-    fn frame(&mut self, text: &str) {
-        self.network.handle_frame(Now::from_millis(self.now), &text.parse().unwrap());
-        self.drain();
-    }
-
-    /// Runs timers; the device sends its heartbeat once that is switched on.
-    fn run(&mut self, millis: u64) -> &mut Self {
-        let end = self.now + millis;
-        while self.now < end {
-            self.now += 1;
-            let now = Now::from_millis(self.now);
-            if self.network.poll_timeout().is_some_and(|(at, _)| at <= now.instant) {
-                self.network.handle_timeout(now);
-                self.drain();
-            }
-            let period = self.device.objects.get(&object(0x1017, 0)).filter(|_| !self.device.mute);
-            let period = period.map_or(0, |data| u64::from(u16::from_le_bytes([data[0], data[1]])));
-            if period > 0 && self.now.is_multiple_of(period) {
-                self.frame(&format!("701#{:02X}", self.device.state.code()));
-            }
-        }
-        self
-    }
-
-    fn link_up(&mut self) -> &mut Self {
-        self.network.handle_link(Now::from_millis(self.now), true);
-        self.drain();
-        self.run(1400)
-    }
-
-    fn written(&self) -> Vec<String> {
-        self.device.writes.iter().map(|(object, _)| object.to_string()).collect()
-    }
-}
 
 #[test]
 fn r_dst_024_a_node_is_identified_configured_in_the_right_order_and_then_started() {
@@ -477,6 +249,104 @@ fn r_dst_071_088_a_stopped_node_is_not_read_and_its_polled_values_are_not_kept_a
     plant.polled.clear();
     plant.run(3000);
     assert!(plant.polled.len() >= 2 && plant.polled.iter().all(|good| !*good), "{:?}", plant.polled);
+}
+
+#[test]
+fn r_dst_088_a_reading_that_others_leave_no_room_for_waits_and_has_not_failed() {
+    let mut plant = Plant::new(steps());
+    plant.link_up();
+    let seen = plant.polled.len();
+    while plant.polled.len() == seen {
+        plant.run(1);
+    }
+    plant.run(900);
+    plant.polled.clear();
+    let mut asked = 0;
+    let node = NodeId::new(1).unwrap();
+    while plant
+        .network
+        .request_sdo(
+            Now::from_millis(plant.now),
+            node,
+            TransferId(asked),
+            SdoRequest::read(object(0x1018, 1)),
+        )
+        .is_ok()
+    {
+        asked += 1;
+    }
+    // The frames of these leave late, so that the reading is due before the first is answered.
+    plant.now += 200;
+    plant.network.handle_timeout(Now::from_millis(plant.now));
+    plant.run(1500);
+    assert!(asked > 2 && !plant.polled.is_empty(), "{asked}");
+    assert!(plant.polled.iter().all(|good| *good), "{:?}", plant.polled);
+}
+
+#[test]
+fn r_dst_059_a_running_node_that_nobody_starts_is_given_back_also_where_its_state_was_not_known() {
+    for known in [true, false] {
+        let steps = vec![BootStep::Pdo(setup(MappingMode::Write, false))];
+        let mut plant = Plant::with(steps, |node| node.start.auto_start = false);
+        plant.device.state = NmtState::Operational;
+        if known {
+            plant.frame("701#05");
+        }
+        plant.link_up();
+        assert_eq!(plant.nmt, ["000#8001", "000#0101"], "known: {known}");
+    }
+}
+
+#[test]
+fn r_dst_023_that_a_node_is_taken_out_of_operation_is_told_and_what_it_sent_before_is_no_surprise() {
+    for on_its_way in ["181#0000000000000000", "701#05"] {
+        let mut plant = Plant::new(vec![BootStep::Pdo(setup(MappingMode::Write, false))]);
+        plant.device.state = NmtState::Operational;
+        plant.frame("701#05");
+        plant.in_flight = Some(on_its_way);
+        plant.link_up();
+        let (running, taken_out) = ((NmtState::Operational, true), (NmtState::PreOperational, true));
+        assert_eq!(plant.states, [running, taken_out, running], "{on_its_way}");
+        assert_eq!(plant.surprises, 0, "{on_its_way}");
+    }
+}
+
+#[test]
+fn r_dst_023_a_node_that_could_not_be_told_to_leave_operation_is_still_in_it() {
+    let mut plant = Plant::new(vec![BootStep::Pdo(setup(MappingMode::Write, false))]);
+    plant.device.state = NmtState::Operational;
+    plant.frame("701#05");
+    plant.states.clear();
+    plant.network.handle_link(Now::from_millis(0), true);
+    let mut refused = false;
+    for _ in 0..200 {
+        plant.now += 1;
+        plant.network.handle_timeout(Now::from_millis(plant.now));
+        while let Some(output) = plant.network.poll_output() {
+            let now = Now::from_millis(plant.now);
+            match output {
+                NetworkOutput::Transmit(frame) if frame.id() == CanId::Standard(0) && !refused => {
+                    refused = true;
+                    plant.network.handle_not_sent(now, &frame);
+                }
+                NetworkOutput::Transmit(frame) if !refused => {
+                    let answer = plant.device.answer(&frame);
+                    if let Some(answer) = answer {
+                        plant.network.handle_frame(now, &answer);
+                    }
+                }
+                NetworkOutput::Transmit(frame) => panic!("{frame}: not before it is tried again"),
+                NetworkOutput::Node(_, NodeEvent::State { to, ordered, .. }) => {
+                    plant.states.push((to, ordered));
+                }
+                NetworkOutput::Node(..) | NetworkOutput::Foreign(_) => {}
+            }
+        }
+    }
+    assert!(refused);
+    assert_eq!(plant.states, [(NmtState::PreOperational, true), (NmtState::Operational, true)]);
+    plant.run(3000);
+    assert_eq!(plant.nmt, ["000#8001", "000#0101"], "it is tried again");
 }
 
 /// The device with an RPDO that carries 0x6411:1 at 0x201, looked at before it is started.

@@ -168,6 +168,7 @@ fn a_synchronous_tpdo_that_comes_after_the_window_is_told() {
             }
         }
         bench.frame(210, "181#00").frame(211, "181#00").frame(290, "281#00");
+        bench.frame(291, "181#R1").frame(292, "181#");
         let told = bench.take_those_with("Window");
         assert_eq!(told, ["211 PdoOutsideWindow { pdo: PdoIndex(0), after: 11ms }"], "produced: {produced}");
     }

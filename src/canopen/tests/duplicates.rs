@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::bench::{Bench, detcon, master, mute, passive, running, running_with};
+use crate::canopen::boot::BootSettings;
 use crate::canopen::object::ObjectId;
 use crate::canopen::sdo::{SdoRequest, SdoSettings, TransferId};
 use crate::canopen::{ErrorControl, NmtRequest, NodeId, NodeSettings};
@@ -226,4 +227,14 @@ fn a_boot_up_while_tpdos_go_on_is_a_second_node() {
         bench.take_those_with("Duplicate"),
         ["460 DuplicateSuspected { evidence: \"a boot-up message while TPDOs go on\" }"]
     );
+}
+
+#[test]
+fn r_dst_059_a_device_that_starts_by_itself_is_alone_though_its_tpdos_follow_its_boot_up_message() {
+    for self_starting in [true, false] {
+        let boot = BootSettings { self_starting, ..BootSettings::default() };
+        let mut bench = running_with(NodeSettings { boot, sdo: Some(SdoSettings::default()), ..detcon(1) });
+        bench.frames(&[(400, "181#0000000000000000"), (450, "701#00"), (460, "281#0000000000000000")]);
+        assert_eq!(bench.take_those_with(TOLD).is_empty(), self_starting);
+    }
 }

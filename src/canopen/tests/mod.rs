@@ -11,6 +11,7 @@
 
 mod bench;
 mod boot;
+mod boot_plant;
 mod broadcasts;
 mod duplicates;
 mod duties;

@@ -69,6 +69,29 @@ fn a_node_that_an_operator_stops_is_sent_nothing_from_the_order_on() {
 }
 
 #[test]
+fn a_node_that_another_master_stops_is_sent_nothing_until_it_tells_its_state() {
+    for command in ["000#0201", "000#8001", "000#8101", "000#0200"] {
+        let mut bench = Bench::new(master(vec![node()]));
+        write(&mut bench, 0, 0, 7);
+        bench.frame(10, "701#05").take();
+        bench.frame(100, command).run(400);
+        assert!(sent(&mut bench).is_empty(), "{command}");
+        bench.frame(501, "701#85").run(510);
+        assert_eq!(sent(&mut bench), ["501 201#0700"], "{command} did not reach it");
+    }
+}
+
+#[test]
+fn a_stop_that_did_not_leave_changes_nothing() {
+    let mut bench = Bench::new(master(vec![node()]));
+    write(&mut bench, 0, 0, 7);
+    bench.frame(10, "701#05").take();
+    assert!(bench.request(100, 1, NmtRequest::Stop));
+    bench.not_sent(110, "000#0201").run(150);
+    assert_eq!(sent(&mut bench), ["110 201#0700"]);
+}
+
+#[test]
 fn nothing_is_sent_while_the_bus_cannot_be_used_nor_before_the_node_is_heard_again() {
     let mut bench = Bench::new(master(vec![node()]));
     write(&mut bench, 0, 0, 7);

@@ -52,10 +52,11 @@ impl NodeLayout {
         carrier.placed.retain(|placed| adopted.iter().all(|adopted| adopted.placed.tag != placed.tag));
         let mut bit = 0_u32;
         for mapped in maps {
-            // Of fewer bits than its type has, no value can be made.
-            let whole = adopted
-                .iter()
-                .filter(|tag| tag.object == mapped.object && tag.placed.field.width <= mapped.bits);
+            // Of fewer bits than its type has, no value can be made; nor of what lies behind the 64th.
+            let whole = adopted.iter().filter(|tag| {
+                let width = tag.placed.field.width;
+                tag.object == mapped.object && width <= mapped.bits && bit + u32::from(width) <= 64
+            });
             carrier.placed.extend(whole.filter_map(|tag| {
                 let mut placed = tag.placed;
                 placed.field.bit = u8::try_from(bit).ok()?;
@@ -95,5 +96,43 @@ impl NodeLayout {
         let has = |carrier: &CarrierLayout, tag| carrier.placed.iter().any(|placed| placed.tag == tag);
         let tags = self.adopted.iter().map(|adopted| adopted.placed.tag);
         tags.filter(|tag| !self.carriers.iter().any(|carrier| has(carrier, *tag))).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mapping::{Field, FieldKind};
+
+    /// In which carriers one signed tag of 32 bits stands, and whether it is missing: carrier 0 is a TPDO with this
+    /// content, carrier 1 what is read.
+    fn places(maps: &[u32], read: bool) -> (Vec<usize>, bool) {
+        let field = Field { bit: 0, width: 32, kind: FieldKind::Signed, big_endian: false, invert: false };
+        let tag = Adopted {
+            object: ObjectId::new(0x9130, 2),
+            poll: read.then_some(CarrierIndex(1)),
+            placed: Placed { tag: TagIndex(0), field, scale: None, unit: None },
+        };
+        let carriers = vec![CarrierLayout::default(), CarrierLayout::default()];
+        let mut layout = NodeLayout { carriers, received: 2, derived: Vec::new(), adopted: vec![tag] };
+        let maps: Vec<_> = maps.iter().copied().map(MappedObject::from_entry).collect();
+        layout.adopt(PdoIndex(0), &maps, &[Vec::new()]);
+        let has = |place: &usize| layout.carriers[*place].placed.len() == 1;
+        ((0..2).filter(has).collect(), !layout.missing().is_empty())
+    }
+
+    #[test]
+    fn r_dst_024_a_tag_of_which_too_few_bits_come_is_read_or_missing() {
+        for (maps, sent) in [
+            (&[0x9130_0220][..], true),
+            (&[0x9130_0240], true),
+            (&[0x9130_0120, 0x9130_0220], true),
+            (&[0x9130_0210], false),
+            (&[0x9130_0120, 0x6150_0108, 0x9130_0220], false),
+            (&[0x6130_01FF, 0x6130_01FF, 0x9130_0220], false),
+        ] {
+            assert_eq!(places(maps, true), (vec![usize::from(!sent)], false), "{maps:X?}");
+            assert_eq!(places(maps, false), (if sent { vec![0] } else { vec![] }, !sent), "{maps:X?}");
+        }
     }
 }

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::time::Duration;
 
-use super::super::builtin::{BuiltinAlarm, OF_BUS, OF_GATEWAY, OF_NODE};
+use super::super::builtin::{BuiltinAlarm, OF_BUS, OF_GATEWAY, OF_NODE, is_of_module};
 use super::super::file::{AlarmSection, IdentitySection};
 use super::super::table::{AlarmCondition, AlarmDef, AlarmOwner, BuiltIn};
 use super::super::{At, SourceText};
@@ -141,9 +141,14 @@ fn built_in(
     known: &mut BTreeSet<String>,
 ) -> Vec<Draft> {
     let mut drafts = Vec::new();
-    for builtin in OF_NODE {
+    let is_module = context.file.esd.is_some();
+    let watched = |builtin: &&BuiltinAlarm| {
+        if is_module { is_of_module(builtin.condition) } else { builtin.condition != BuiltIn::NotConfigured }
+    };
+    for builtin in OF_NODE.iter().filter(watched) {
         // Who is not asked who it is cannot be another.
         let asked = BuiltIn::IdentityMismatch != builtin.condition
+            || is_module
             || context.file.identity.as_ref().is_some_and(|identity| *identity != IdentitySection::default());
         let one = [(builtin.name.to_owned(), builtin.text.to_owned(), builtin.condition, asked)];
         let each = pdos.iter().enumerate().map(|(place, pdo)| {

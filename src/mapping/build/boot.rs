@@ -42,52 +42,69 @@ pub fn steps(problems: &mut Problems, context: &Context<'_>) -> Vec<BootStep> {
     steps.extend(setups);
     steps.extend(units::objects(context).into_iter().map(|(object, _)| BootStep::Read { object }));
     let before_pdos = steps.len();
-    for (place, tpdo) in context.tpdos.iter().enumerate() {
-        let section = tpdo.section;
-        let mode = match section.mapping {
-            MappingWord::Adopt => {
-                refuse_changes(problems, context, tpdo);
-                MappingMode::Adopt { timed: node::is_untimed(context, section) }
-            }
-            word @ (MappingWord::Write | MappingWord::Verify | MappingWord::Fixed) => {
-                match mapping_mode(word).filter(|_| !section.maps.is_empty()) {
-                    Some(mode) => mode,
-                    None => continue,
-                }
-            }
-        };
-        let mut number = |at: Option<(&SourceText, &At<u64>)>, what: &str, highest: u64| {
-            at.map(|(source, at)| problems.within(source, at, what, 0..=highest))
-        };
-        let transmission_type = number(tpdo.transmission_type(context), "transmission_type", 255);
-        let event_timer = number(tpdo.event_timer(context), "event_timer_ms", 65_535);
-        let inhibit_time = number(tpdo.inhibit_time(context), "inhibit_time_us", 6_553_500);
-        if let Some((source, at)) = tpdo.inhibit_time(context).filter(|(_, at)| !at.value.is_multiple_of(100))
-        {
-            let message = format!("inhibit_time_us {} cannot be set", at.value);
-            problems.error(source, &at.span, message, "devices count in steps of 100 us");
-        }
-        steps.push(BootStep::Pdo(PdoSetup {
-            pdo: PdoIndex(place),
-            number: u16::try_from(tpdo.number).unwrap_or_default(),
-            mode,
-            maps: section.maps.iter().filter_map(|entry| node::mapped(&entry.value)).collect(),
-            transmission_type: transmission_type.and_then(|number| u8::try_from(number).ok()),
-            inhibit_time: inhibit_time.and_then(|micros| u16::try_from(micros / 100).ok()),
-            event_timer: event_timer.and_then(|millis| u16::try_from(millis).ok()),
-            set_invalid: section.set_pdo_invalid,
-        }));
-    }
-    // A device that has identifiers of its own for its TPDOs may have one for its emergency messages too (R-DST-119).
-    if steps.len() > before_pdos {
+    let pdos = context.tpdos.iter().enumerate();
+    steps.extend(pdos.filter_map(|(place, tpdo)| pdo(problems, context, place, tpdo)));
+    steps.extend(rpdo::steps(context));
+    // A device that is asked anything is asked which identifier its emergency messages have (R-DST-119).
+    let is_read = context.items.list.iter().any(|item| {
+        let Entry::Tag(section) = item.entry else { return false };
+        node::polled(context, section).is_some()
+    });
+    if !steps.is_empty() || is_read || context.file.emergency.register_poll_ms.is_some() {
         steps.insert(before_pdos, BootStep::Read { object: EMERGENCY_ID });
     }
-    steps.extend(rpdo::steps(context));
     let start = &context.file.start;
     if context.entry.save_after_config.or(start.save_after_config).unwrap_or(false) && !steps.is_empty() {
         steps.push(BootStep::Save);
     }
     steps
+}
+
+/// How a TPDO is seen to; `None` where the device is not asked. Its numbers are looked at all the same, as its time-out
+/// follows from them.
+fn pdo(problems: &mut Problems, context: &Context<'_>, place: usize, tpdo: &Tpdo<'_>) -> Option<BootStep> {
+    let section = tpdo.section;
+    let mut number = |at: Option<(&SourceText, &At<u64>)>, what: &str, highest: u64| {
+        at.map(|(source, at)| problems.within(source, at, what, 0..=highest))
+    };
+    let transmission_type = number(tpdo.transmission_type(context), "transmission_type", 255);
+    let event_timer = number(tpdo.event_timer(context), "event_timer_ms", 65_535);
+    let inhibit_time = number(tpdo.inhibit_time(context), "inhibit_time_us", 6_553_500);
+    if let Some((source, at)) = tpdo.inhibit_time(context).filter(|(_, at)| !at.value.is_multiple_of(100)) {
+        let message = format!("inhibit_time_us {} cannot be set", at.value);
+        problems.error(source, &at.span, message, "devices count in steps of 100 us");
+    }
+    let written = mapping_mode(section.mapping).filter(|_| !section.maps.is_empty());
+    check_set_invalid(problems, context.source, &section.set_pdo_invalid, written);
+    let mode = if tpdo.is_adopted() {
+        refuse_changes(problems, context, tpdo);
+        MappingMode::Adopt { timed: node::is_untimed(context, section) }
+    } else {
+        written?
+    };
+    Some(BootStep::Pdo(PdoSetup {
+        pdo: PdoIndex(place),
+        number: u16::try_from(tpdo.number).unwrap_or_default(),
+        mode,
+        maps: section.maps.iter().filter_map(|entry| node::mapped(&entry.value)).collect(),
+        transmission_type: transmission_type.and_then(|number| u8::try_from(number).ok()),
+        inhibit_time: inhibit_time.and_then(|micros| u16::try_from(micros / 100).ok()),
+        event_timer: event_timer.and_then(|millis| u16::try_from(millis).ok()),
+        set_invalid: section.set_pdo_invalid.value,
+    }))
+}
+
+/// A PDO is marked as not valid only while its mapping is written.
+pub fn check_set_invalid(
+    problems: &mut Problems,
+    source: &SourceText,
+    at: &At<bool>,
+    mode: Option<MappingMode>,
+) {
+    if at.value && mode != Some(MappingMode::Write) {
+        let message = "the mapping of this PDO is not written, so `set_pdo_invalid` means nothing";
+        problems.error(source, &at.span, message, "leave it out, or write `maps` and mapping = \"write\"");
+    }
 }
 
 /// What is done with a PDO mapping; `None`: nothing, or it is taken as it is.
@@ -131,6 +148,11 @@ fn refuse_changes(problems: &mut Problems, context: &Context<'_>, tpdo: &Tpdo<'_
             let message = format!("a TPDO that is adopted is not changed, so `{key}` would never be written");
             problems.error(source, &at.span, message, "leave it out, or write mapping = \"write\"");
         }
+    }
+    if let Some(bits) = tpdo.section.reserved_bits.first() {
+        let message = "what stands where in a TPDO that is adopted is for the device to say, so `reserved_bits` means \
+                       nothing";
+        problems.error(context.source, &bits.span, message, "leave it out, or write mapping = \"write\"");
     }
 }
 
@@ -192,13 +214,15 @@ pub fn polls(problems: &mut Problems, context: &Context<'_>) -> Vec<Poll> {
         let millis = problems.within(context.source, at, "poll_ms", 100..=86_400_000);
         let bits = super::fields::whole(section).map_or(8, |field| field.width);
         let length = usize::from(bits.div_ceil(8));
-        polls.push(Poll { object, period: Duration::from_millis(millis), length, read_by_boot: false });
+        let period = Duration::from_millis(millis);
+        polls.push(Poll { object, period, length, read_by_boot: false, unless_sent: Some(bits) });
     }
     polls.extend(units::objects(context).into_iter().map(|(object, length)| Poll {
         object,
         period: UNIT_PERIOD,
         length,
         read_by_boot: true,
+        unless_sent: None,
     }));
     polls
 }

@@ -16,14 +16,19 @@ const LONGEST: u64 = 60_000_000;
 pub fn sync(problems: &mut Problems, config: &SourceText, bus: &BusEntry) -> Option<SyncSettings> {
     let At { value: entry, span } = bus.sync.as_ref()?;
     let produced = entry.producer == ProducerWord::Gateway;
+    let is_off = [&entry.period_ms, &entry.period_us].into_iter().flatten().any(|at| at.value == 0);
     let period = period(problems, config, entry);
-    if produced && period.is_none() {
+    if produced && period.is_none() && !is_off {
         let message = "SYNC has no period";
         problems.error(config, span, message, "give it `period_ms`, or `producer = \"other\"`");
     }
-    if produced && Role::from(bus.role) == Role::Passive {
+    if produced && !is_off && Role::from(bus.role) == Role::Passive {
         let message = "the gateway is passive on this bus, so it sends no SYNC";
         problems.warning(config, span, message, "write `producer = \"other\"`, or leave it out");
+    }
+    if let Some(counter) = entry.counter.as_ref().filter(|_| !produced) {
+        let message = "the gateway does not send SYNC here, so `counter` means nothing";
+        problems.error(config, &counter.span, message, "leave it out, or write `producer = \"gateway\"`");
     }
     let overflow = entry.counter.as_ref().filter(|counter| counter.value != 0);
     let overflow = overflow.map(|counter| problems.within(config, counter, "counter", 2..=240));
@@ -36,8 +41,10 @@ pub fn sync(problems: &mut Problems, config: &SourceText, bus: &BusEntry) -> Opt
         }
         Duration::from_micros(micros)
     });
-    Some(SyncSettings {
-        cob_id: identifier(problems, config, entry.cob_id.as_ref(), cob_id::SYNC),
+    let cob_id = identifier(problems, config, entry.cob_id.as_ref(), cob_id::SYNC);
+    // A period of 0 is no SYNC, as in 0x1006 (R-ESD-114).
+    (!produced || !is_off).then_some(SyncSettings {
+        cob_id,
         produced,
         period,
         overflow: overflow.and_then(|overflow| u8::try_from(overflow).ok()),
@@ -87,6 +94,7 @@ fn period(problems: &mut Problems, config: &SourceText, entry: &SyncEntry) -> Op
             problems.error(config, &micros.span, "SYNC has two periods", "leave one of them out");
             None
         }
+        (Some(At { value: 0, .. }), None) | (None, Some(At { value: 0, .. }) | None) => None,
         (Some(millis), None) => {
             let millis = problems.within(config, millis, "period_ms", 1..=LONGEST / 1_000);
             Some(Duration::from_millis(millis))
@@ -94,7 +102,6 @@ fn period(problems: &mut Problems, config: &SourceText, entry: &SyncEntry) -> Op
         (None, Some(micros)) => {
             Some(Duration::from_micros(problems.within(config, micros, "period_us", 1_000..=LONGEST)))
         }
-        (None, None) => None,
     }
 }
 

@@ -25,7 +25,8 @@ pub fn poll(problems: &mut Problems, context: &Context<'_>) -> Option<Poll> {
     let at = context.file.emergency.register_poll_ms.as_ref()?;
     let millis = problems.within(context.source, at, "register_poll_ms", 100..=86_400_000);
     let read_by_boot = context.file.emergency.read_at_boot;
-    Some(Poll { object: ERROR_REGISTER, period: Duration::from_millis(millis), length: 1, read_by_boot })
+    let period = Duration::from_millis(millis);
+    Some(Poll { object: ERROR_REGISTER, period, length: 1, read_by_boot, unless_sent: None })
 }
 
 /// The errors that the mapping names. The poll of the error register is the last of `polls`.
@@ -175,15 +176,16 @@ pub fn source(
         let message = format!("`{}` comes from emergency messages: `{key}` means nothing here", item.name);
         problems.error(source, span, message, "leave it out, or `emergency`");
     }
-    let field = fields::whole(section)
-        .filter(|field| field.kind == FieldKind::Unsigned && field.width <= part.width());
+    // Of a code, a register or a number some bits alone would be another one; the maker's bytes may hold several things.
+    let fits = |width| width == part.width() || part == EmergencyPart::Vendor && width < part.width();
+    let field = fields::whole(section).filter(|field| field.kind == FieldKind::Unsigned && fits(field.width));
     if field.is_none() {
         let message = format!("`{}` is no type for this part of emergency messages", section.kind.value);
         problems.error(source, &section.kind.span, message, format!("use u{}", part.width()));
     }
     let big_endian = section.byte_order == ByteOrderWord::Big;
     let whole = Field { bit: 0, width: part.width(), kind: FieldKind::Unsigned, big_endian, invert: false };
-    let field = Field { bit: part.first_bit(), big_endian, ..field.unwrap_or(whole) };
+    let field = Field { bit: part.first_bit(), ..field.unwrap_or(whole) };
     fields::check_byte_order(problems, source, &section.kind.span, &item.name, field);
     Some((part, field))
 }

@@ -60,7 +60,9 @@ pub fn field(
     let stride = stride(problems, source, section);
     let Some((number, first)) = place(problems, context, item, section) else {
         let field = of_type(problems, context, section, 0);
-        return (NO_TPDO, Field { big_endian: false, ..field });
+        let span = section.object.as_ref().map_or(&item.span, |object| &object.span);
+        check_byte_order(problems, source, span, &item.name, field);
+        return (NO_TPDO, field);
     };
     let bit = first.value.saturating_add(item.element.index.saturating_mul(stride));
     let field = of_type(problems, context, section, bit);
@@ -131,6 +133,10 @@ fn place(
     let source = context.source;
     match (&section.tpdo, &section.bit, &section.object) {
         (Some(tpdo), Some(bit), None) => {
+            if let Some(at) = &section.poll_ms {
+                let message = format!("`{}` stands in a TPDO, so `poll_ms` means nothing", item.name);
+                problems.error(source, &at.span, message, "leave it out; it is for tags with `object`");
+            }
             if context.tpdos.iter().any(|known| known.number == tpdo.value && known.is_adopted()) {
                 let message =
                     format!("where `{}` stands in TPDO {} is for the device to say", item.name, tpdo.value);
@@ -140,11 +146,9 @@ fn place(
         }
         (None, None, Some(object)) => {
             let id = node::object(problems, source, object)?;
-            if let Some(array) = &section.array {
-                let message = "an array cannot be one object".to_owned();
-                problems.error(source, &array.span, message, "write an entry for each object");
-            }
-            check_width(problems, context, section, object, id);
+            refuse_array(problems, source, section);
+            let maps = context.tpdos.iter().flat_map(|tpdo| &tpdo.section.maps);
+            check_width(problems, source, section, (object, id), maps);
             let found = node::in_pdo(context, id);
             if found.is_none() && section.poll_ms.is_none() && node::adopted(context, section).is_none() {
                 let message = format!("no TPDO maps {id}, so `{}` would never have a value", item.name);
@@ -167,21 +171,29 @@ fn place(
     }
 }
 
-/// A TPDO that carries fewer bits of an object than its type has would leave the rest to its neighbour.
-fn check_width(
+/// All elements of an array would be the same object.
+pub fn refuse_array(problems: &mut Problems, source: &SourceText, section: &TagSection) {
+    if let Some(array) = &section.array {
+        let message = "an array cannot be one object";
+        problems.error(source, &array.span, message, "write an entry for each object");
+    }
+}
+
+/// A PDO that carries fewer bits of an object than its type has would leave the rest to its neighbour.
+pub fn check_width<'a>(
     problems: &mut Problems,
-    context: &Context<'_>,
+    source: &SourceText,
     section: &TagSection,
-    object: &At<String>,
-    id: ObjectId,
+    (object, id): (&At<String>, ObjectId),
+    maps: impl IntoIterator<Item = &'a At<String>>,
 ) {
-    let entries = context.tpdos.iter().flat_map(|tpdo| &tpdo.section.maps);
-    let bits = entries.filter_map(|entry| node::mapped(&entry.value)).find(|entry| entry.object == id);
+    let bits =
+        maps.into_iter().filter_map(|entry| node::mapped(&entry.value)).find(|entry| entry.object == id);
     if let Some((bits, (_, width))) = bits.map(|entry| entry.bits).zip(parse(&section.kind.value))
         && width > bits
     {
         let message = format!("{id} is mapped with {bits} bits, but `{}` has {width}", section.kind.value);
-        problems.error(context.source, &object.span, message, "let `type` and `maps` agree");
+        problems.error(source, &object.span, message, "let `type` and `maps` agree");
     }
 }
 
@@ -203,7 +215,8 @@ pub fn poll(context: &Context<'_>, item: &Item<'_>) -> Option<usize> {
 /// The field of a polled object: all of its bytes.
 pub fn whole(section: &TagSection) -> Option<Field> {
     let (kind, width) = parse(&section.kind.value)?;
-    Some(Field { bit: 0, width, kind, big_endian: false, invert: section.invert })
+    let big_endian = section.byte_order == ByteOrderWord::Big;
+    Some(Field { bit: 0, width, kind, big_endian, invert: section.invert })
 }
 
 /// Only whole bytes can be turned round.

@@ -4,8 +4,10 @@
 //! - `items`: the tags of a mapping, arrays unrolled. `tags`, `fields`, `derived`: what they become; `units`: those of the device.
 //! - `node`: what the CANopen master needs to know; `boot`: what it does before it starts the node.
 //! - `alarms`: alarms, their order and what suppresses them. `emergency`: errors that emergency messages tell of.
+//! - `writable`: objects that may be written by SDO.
 //! - `broadcasts`: SYNC and TIME of a bus; `sync`: PDOs that go with SYNC; `rpdo`: what nodes are sent.
-//! - `addresses`, `network`: what must not happen twice among nodes.
+//! - `esd`: nodes that are esd modules; `lines`: their serial lines, `line_keys`: what these ask in vain; `offers`: where these are offered.
+//! - `addresses`, `network`, `esd_clashes`: what must not happen twice among nodes. `load`: whether a bus can carry it all.
 //! - `order`: causes before consequences. `problems`: where messages are collected.
 //! - [`sketch`]: an installation without a configuration file.
 
@@ -15,10 +17,16 @@ mod boot;
 mod broadcasts;
 mod derived;
 mod emergency;
+mod esd;
+mod esd_clashes;
 mod fields;
 mod items;
+mod line_keys;
+mod lines;
+mod load;
 mod network;
 mod node;
+mod offers;
 mod order;
 mod problems;
 mod rpdo;
@@ -28,14 +36,19 @@ mod tags;
 #[cfg(test)]
 mod tests;
 mod units;
+mod writable;
 
+// Addresses only; nothing here opens a socket.
+use core::net::SocketAddr;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use self::addresses::Claims;
 use self::items::{Element, Items};
+use self::load::Load;
 use self::network::Taken;
 use self::node::Tpdo;
+pub use self::offers::share_port;
 use self::problems::Problems;
 pub use self::problems::{is_name, is_snake_case, sort_problems};
 use self::rpdo::Rpdo;
@@ -46,10 +59,11 @@ use super::installation::{BusEntry, NodeEntry, ProducerWord, SyncEntry};
 use super::reader::{self, Read};
 use super::shipped::{SHIPPED, shipped};
 use super::suggest::closest;
-use super::table::{BusDef, DeviceDef, NodeDef, PublishDef, TagTable};
+use super::table::{BusDef, DeviceDef, NodeDef, Protocol, PublishDef, TagTable};
 use super::{At, Diagnostic, SourceText};
 use crate::can::{BIT_RATES, BusIndex, DEFAULT_BIT_RATE};
 use crate::canopen::NodeId;
+use crate::esd::{ModuleKind, ModuleNumber};
 use crate::process_image::{NodeIndex, TagIndex};
 
 /// Version of the mapping format that this program reads.
@@ -73,6 +87,8 @@ pub struct Installation<'a> {
     pub nodes: &'a BTreeMap<At<String>, NodeEntry>,
     /// Mapping files by the name that nodes call them; one that is missing here is looked for among the shipped ones.
     pub mappings: &'a BTreeMap<String, SourceText>,
+    /// Where the gateway listens apart from serial lines, and who does.
+    pub listeners: &'a [(SocketAddr, String)],
     /// Names of buses and mappings that could not be read: that they are missing is not told again.
     pub lost: &'a [String],
 }
@@ -91,7 +107,9 @@ pub fn build(installation: &Installation<'_>) -> Result<(TagTable, Vec<Diagnosti
             ..TagTable::default()
         },
         taken: Taken::default(),
+        load: Load::default(),
         claims: Vec::new(),
+        ports: installation.listeners.to_vec(),
     };
     for (index, bus) in builder.table.buses.iter().enumerate() {
         builder.taken.broadcasts(&mut problems, installation, BusIndex(index), bus);
@@ -99,7 +117,13 @@ pub fn build(installation: &Installation<'_>) -> Result<(TagTable, Vec<Diagnosti
     for (name, entry) in installation.nodes {
         builder.node(&mut problems, &files, name, entry);
     }
-    addresses::check_nodes(&mut problems, installation.config, &builder.claims);
+    let Builder { load, claims, table, .. } = &mut builder;
+    load.check(&mut problems, installation, &table.buses);
+    for (node, offset) in addresses::place(&mut problems, installation.config, claims) {
+        table.nodes.get_mut(node.0).into_iter().for_each(|def| def.offset = offset);
+    }
+    addresses::check_nodes(&mut problems, installation.config, claims);
+    esd_clashes::check(&mut problems, installation, &mut builder.taken, &builder.table);
     if problems.has_errors() { Err(problems.sorted()) } else { Ok((builder.table, problems.sorted())) }
 }
 
@@ -137,6 +161,7 @@ fn buses(problems: &mut Problems, installation: &Installation<'_>) -> Vec<BusDef
             sync: broadcasts::sync(problems, config, entry),
             time: broadcasts::time(problems, config, entry),
             own_heartbeat: broadcasts::own_heartbeat(problems, config, entry),
+            esd: esd::bus(problems, config, entry),
         });
     }
     buses
@@ -179,7 +204,17 @@ struct Builder<'a> {
     installation: &'a Installation<'a>,
     table: TagTable,
     taken: Taken,
+    load: Load,
     claims: Vec<Claims>,
+    /// Where the gateway and its serial lines listen, and whose it is.
+    ports: Vec<(SocketAddr, String)>,
+}
+
+/// What the mapping of a node says that it speaks, with its number there.
+#[derive(Clone, Copy)]
+enum Speaks {
+    Canopen(NodeId),
+    Esd(ModuleKind, ModuleNumber),
 }
 
 impl Builder<'_> {
@@ -193,15 +228,16 @@ impl Builder<'_> {
         let config = self.installation.config;
         problems.name(config, name, "node");
         let bus = self.bus(problems, entry);
-        let id = problems.within(config, &entry.id, "node id", 1..=127);
-        let id = u8::try_from(id).ok().and_then(NodeId::new);
-        if let (Some(bus), true) = (bus, (1..=127).contains(&entry.id.value)) {
-            self.taken.node_id(problems, self.installation, name, entry, bus);
-        } else {
+        let mapping = files.get(&entry.mapping.value);
+        // Which numbers there are cannot be said where the section is wrong that says what the device is.
+        if mapping.is_some_and(|mapping| mapping.read.lost.iter().any(|lost| lost == "esd")) {
             self.taken.ignore(name);
+            return;
         }
+        let module = mapping.and_then(|mapping| mapping.read.content.as_ref()?.esd.as_ref());
+        let speaks = self.number(problems, name, entry, bus, module.map(|esd| esd.module.value.into()));
         let unit_id = self.unit_id(problems, entry);
-        let Some(mapping) = files.get(&entry.mapping.value) else {
+        let Some(mapping) = mapping else {
             let mapping = &entry.mapping;
             if self.installation.lost.contains(&mapping.value) {
                 return;
@@ -214,7 +250,7 @@ impl Builder<'_> {
             problems.error(config, &mapping.span, message, hint);
             return;
         };
-        let (Some(file), Some(id)) = (&mapping.read.content, id) else { return };
+        let (Some(file), Some(speaks)) = (&mapping.read.content, speaks) else { return };
         let items = Items::new(problems, &mapping.source, file, &mapping.read.lost);
         let context = Context {
             source: &mapping.source,
@@ -228,7 +264,31 @@ impl Builder<'_> {
             node: NodeIndex(self.table.nodes.len()),
             base: self.table.tags.len(),
         };
-        self.add(problems, &context, name, bus.unwrap_or_default(), id, unit_id);
+        esd::refuse_keys(problems, config, entry, module.is_some());
+        self.add(problems, &context, name, bus.unwrap_or_default(), speaks, unit_id);
+    }
+
+    /// The number of a node in its world. What is wrong with it is told, and its identifiers are not looked at then.
+    fn number(
+        &mut self,
+        problems: &mut Problems,
+        name: &At<String>,
+        entry: &NodeEntry,
+        bus: Option<BusIndex>,
+        module: Option<ModuleKind>,
+    ) -> Option<Speaks> {
+        let config = self.installation.config;
+        let (what, limits) = if module.is_some() { ("module number", 1..=254) } else { ("node id", 1..=127) };
+        let id = u8::try_from(problems.within(config, &entry.id, what, limits.clone())).ok()?;
+        match (bus.filter(|_| limits.contains(&entry.id.value)), module) {
+            (Some(bus), Some(_)) => self.taken.module_number(problems, config, name, entry, bus),
+            (Some(bus), None) => self.taken.node_id(problems, self.installation, name, entry, bus),
+            (None, _) => self.taken.ignore(name),
+        }
+        match module {
+            Some(kind) => ModuleNumber::new(id).map(|number| Speaks::Esd(kind, number)),
+            None => NodeId::new(id).map(Speaks::Canopen),
+        }
     }
 
     fn bus(&self, problems: &mut Problems, entry: &NodeEntry) -> Option<BusIndex> {
@@ -246,6 +306,9 @@ impl Builder<'_> {
         let at = entry.unit_id.as_ref().unwrap_or(&entry.id);
         if entry.unit_id.is_some() {
             problems.within(config, at, "unit_id", 1..=247);
+        } else if (248..=254).contains(&at.value) {
+            let message = format!("module number {} cannot be the Modbus unit id as well", at.value);
+            problems.error(config, &at.span, message, "give the node a `unit_id` of 1 to 247");
         }
         if at.value == u64::from(self.installation.gateway_unit_id) {
             let message = format!("unit id {} is that of the gateway itself", at.value);
@@ -261,24 +324,38 @@ impl Builder<'_> {
         context: &Context<'_>,
         name: &At<String>,
         bus: BusIndex,
-        id: NodeId,
+        speaks: Speaks,
         unit_id: u64,
     ) {
         let (tags, places) = tags::tags(problems, context);
-        fields::check_overlaps(problems, context, &fields::all(context, &tags, &places));
-        rpdo::check_contents(problems, context, &tags, &places);
-        self.claims.push(addresses::of_node(problems, context, name, unit_id, &tags, &places));
-        sync::check_changes(problems, context);
-        let canopen = node::settings(problems, context, id);
-        let emergency = emergency::definition(problems, context, &canopen.polls);
-        self.taken.identifiers(problems, self.installation, name, bus, &canopen);
+        let (protocol, lines) = match speaks {
+            Speaks::Canopen(id) => {
+                fields::check_overlaps(problems, context, &fields::all(context, &tags, &places));
+                rpdo::check_contents(problems, context, &tags, &places);
+                sync::check_changes(problems, context);
+                let canopen = node::settings(problems, context, id);
+                self.taken.identifiers(problems, self.installation, name, bus, &canopen);
+                self.load.add(context, bus, &canopen);
+                (Protocol::Canopen(Box::new(canopen)), Vec::new())
+            }
+            Speaks::Esd(kind, number) => {
+                esd::refuse_sections(problems, context.source, context.file);
+                let module = esd::settings(problems, context, &name.value, kind, number);
+                let lines = offers::lines(problems, context, kind);
+                offers::check_ports(problems, context, &name.value, &lines, &mut self.ports);
+                self.load.add_lines(context, bus, &module, &lines);
+                (Protocol::Esd(Box::new(module)), lines)
+            }
+        };
+        self.claims.push(addresses::of_node(problems, context, name, unit_id, (&tags, &places), &lines));
+        let emergency = emergency::definition(problems, context, protocol.polls());
         let base = self.table.alarms.len();
-        let alarms = alarms::of_node(problems, context, &canopen.pdos, &places, bus, base);
+        let alarms = alarms::of_node(problems, context, protocol.pdos(), &places, bus, base);
         let (device, entry) = (&context.file.device, context.entry);
         self.table.nodes.push(NodeDef {
             name: name.value.clone(),
             bus,
-            canopen,
+            protocol,
             device: DeviceDef {
                 mapping: mapping_name(&entry.mapping.value),
                 vendor: device.vendor.clone(),
@@ -287,18 +364,19 @@ impl Builder<'_> {
                 shipped_lengths: node::shipped_lengths(problems, context),
             },
             unit_id: u8::try_from(unit_id).unwrap_or(1),
-            offset: entry.offset.as_ref().and_then(|offset| u16::try_from(offset.value).ok()).unwrap_or(0),
+            offset: entry.offset.as_ref().and_then(|offset| offset.value.fixed()).unwrap_or(0),
             required: entry.required.unwrap_or(true),
             on_loss: entry.on_loss.into(),
             zero_on_bad: entry.zero_on_bad,
             tags: context.base..context.base + tags.len(),
             alarms: base..base + alarms.len(),
             rpdos: context.rpdos.iter().map(Rpdo::def).collect(),
-            outputs: entry.outputs,
+            outputs: entry.outputs.value,
             reserved_bits: context.tpdos.iter().map(Tpdo::reserved_bits).collect(),
             emergency,
             publish: publish(problems, context, &places),
         });
+        self.table.lines.extend(lines);
         self.table.tags.extend(tags);
         self.table.alarms.extend(alarms);
     }

@@ -23,10 +23,14 @@ const RESTRICTED: [(u32, u32, &str); 7] = [
     (0x780, 0x7FF, "layer setting services"),
 ];
 
+/// The line of what everybody knows: it stands in no file.
+pub const NOWHERE: usize = usize::MAX;
+
 /// What is taken on each bus, and by whom.
 #[derive(Debug, Default)]
 pub struct Taken {
     node_ids: BTreeMap<(BusIndex, u64), String>,
+    module_numbers: BTreeMap<(BusIndex, u64), String>,
     /// With the line in which the owner stands.
     identifiers: BTreeMap<(BusIndex, CanId), (String, usize)>,
     /// Nodes whose bus or id is wrong: what follows from that for their identifiers needs no telling.
@@ -60,9 +64,58 @@ impl Taken {
         }
     }
 
+    /// A module number must be unique on its bus. It may be a node id: the two are different worlds.
+    pub fn module_number(
+        &mut self,
+        problems: &mut Problems,
+        config: &SourceText,
+        name: &At<String>,
+        entry: &NodeEntry,
+        bus: BusIndex,
+    ) {
+        let id = &entry.id;
+        if let Some(other) = self.module_numbers.insert((bus, id.value), name.value.clone()) {
+            let message = format!(
+                "modules `{other}` and `{}` have the same number {} on bus `{}`",
+                name.value, id.value, entry.bus.value
+            );
+            let hint =
+                "every module of a bus needs its own: that of its coding switch, or another stored in it";
+            problems.error(config, &id.span, message, hint);
+            self.ignore(name);
+        }
+    }
+
     /// A node whose identifiers are not to be looked at.
     pub fn ignore(&mut self, name: &At<String>) {
         self.ignored.insert(name.value.clone());
+    }
+
+    /// Whether the identifiers of a node are not to be looked at.
+    pub fn ignores(&self, name: &At<String>) -> bool {
+        self.ignored.contains(&name.value)
+    }
+
+    /// All identifiers of a bus.
+    pub fn of_bus(&self, bus: BusIndex) -> impl Iterator<Item = CanId> + '_ {
+        self.identifiers.keys().filter(move |(of, _)| *of == bus).map(|(_, id)| *id)
+    }
+
+    /// Who has an identifier.
+    pub fn owner(&self, bus: BusIndex, id: CanId) -> Option<&str> {
+        self.identifiers.get(&(bus, id)).map(|(owner, _)| owner.as_str())
+    }
+
+    /// Takes an identifier, or tells who has it already, with the line where that is another than this one.
+    pub fn take(&mut self, bus: BusIndex, id: CanId, owner: &str, line: usize) -> Result<(), String> {
+        match self.identifiers.get(&(bus, id)) {
+            None => {
+                self.identifiers.insert((bus, id), (owner.to_owned(), line));
+                Ok(())
+            }
+            Some((other, at)) if *at == line || *at == NOWHERE => Err(other.clone()),
+            Some((other, at)) => Err(format!("{other} (line {at})")),
+        }
     }
 
     /// The identifiers of SYNC and of TIME: as the configuration tells, else as everybody knows them.
@@ -83,7 +136,7 @@ impl Taken {
         let time = ("TIME", bus.time.map_or(cob_id::TIME, |time| time.cob_id));
         for ((what, id), span) in [sync, time].into_iter().zip(spans) {
             let owner = format!("{what} of bus `{}`", bus.name);
-            self.claim(problems, installation.config, index, id, owner, &span.unwrap_or_default());
+            self.claim(problems, installation.config, index, id, &owner, &span.unwrap_or_default());
         }
     }
 
@@ -107,7 +160,7 @@ impl Taken {
             ("heartbeat and guarding", cob_id::error_control(id)),
         ] {
             let owner = format!("{what} of node `{node}`");
-            self.claim(problems, config, bus, id, owner, &name.span);
+            self.claim(problems, config, bus, id, &owner, &name.span);
         }
         let emergency = settings.emergency.unwrap_or_else(|| cob_id::emcy(settings.id));
         let tpdos = settings.pdos.iter().map(|pdo| (format!("TPDO {}", pdo.number), pdo.cob_id));
@@ -115,7 +168,7 @@ impl Taken {
         for (what, id) in std::iter::once(("emergency".to_owned(), emergency)).chain(tpdos).chain(rpdos) {
             let owner = format!("{what} of node `{node}`");
             let Some(purpose) = restricted(id) else {
-                self.claim(problems, config, bus, id, owner, &name.span);
+                self.claim(problems, config, bus, id, &owner, &name.span);
                 continue;
             };
             let whose = other_node(installation, name, bus, id);
@@ -131,16 +184,12 @@ impl Taken {
         config: &SourceText,
         bus: BusIndex,
         id: CanId,
-        owner: String,
+        owner: &str,
         span: &Range<usize>,
     ) {
         let (line, _) = config.position(span.start);
-        let Some((other, other_line)) = self.identifiers.get(&(bus, id)) else {
-            self.identifiers.insert((bus, id), (owner, line));
-            return;
-        };
-        let elsewhere = if *other_line == line { String::new() } else { format!(" (line {other_line})") };
-        let message = format!("{other}{elsewhere} and {owner} have the same identifier {id}");
+        let Err(other) = self.take(bus, id, owner, line) else { return };
+        let message = format!("{other} and {owner} have the same identifier {id}");
         let hint = "every identifier has one sender on its bus: check the `cob_id` of both, in the configuration and in \
                     the mappings";
         problems.error(config, span, message, hint);

@@ -11,7 +11,7 @@ use super::boot;
 use super::emergency;
 use super::problems::Problems;
 use super::tags::Context;
-use super::{rpdo, sync};
+use super::{rpdo, sync, writable};
 use crate::canopen::boot::BootSettings;
 use crate::canopen::object::{MappedObject, ObjectId};
 use crate::canopen::sdo::SdoSettings;
@@ -44,8 +44,9 @@ pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> N
         error_control,
         start: start(problems, context),
         // Without SDO none of the steps is done, but what they would see to is believed.
-        sdo: ((!steps.is_empty() || !polls.is_empty()) && context.entry.configure != Some(false))
-            .then(|| sdo(problems, context)),
+        sdo: ((!steps.is_empty() || !polls.is_empty() || writable::any(context))
+            && context.entry.configure != Some(false))
+        .then(|| sdo(problems, context)),
         boot: BootSettings { steps, self_starting: is_self_starting(context), ..BootSettings::default() },
         polls,
         rpdos: rpdo::settings(problems, context, id),
@@ -129,12 +130,7 @@ fn error_control(problems: &mut Problems, context: &Context<'_>) -> ErrorControl
     let guard_time = either(context, entry.guard_time_ms.as_ref(), file.guard_time_ms.as_ref());
     let reply = either(context, entry.guard_reply_ms.as_ref(), file.guard_reply_ms.as_ref());
     let factor = either(context, entry.life_time_factor.as_ref(), file.life_time_factor.as_ref());
-    // The time-out of the mapping is meant for the heartbeat of the mapping.
-    let own = file.heartbeat_timeout_ms.as_ref().filter(|_| entry.heartbeat_ms.is_none());
-    let after = either(context, entry.heartbeat_timeout_ms.as_ref(), own);
-    let three = heartbeat(context).map_or(500, |(_, at)| at.value.min(65_535));
-    let usual = Duration::from_millis(3 * three);
-    let timeout = milliseconds(problems, after, "heartbeat_timeout_ms", 10..=65_535, usual);
+    let timeout = heartbeat_timeout(problems, context);
     let life_time_factor =
         factor.map(|(source, at)| problems.within(source, at, "life_time_factor", 1..=255));
     let rtr_dlc = file.rtr_dlc.as_ref().map(|at| problems.within(context.source, at, "rtr_dlc", 0..=8));
@@ -186,14 +182,39 @@ fn kind(problems: &mut Problems, context: &Context<'_>) -> ErrorControlWord {
     let (file, entry) = (&context.file.error_control, context.entry);
     let kind = entry.error_control.as_ref().map_or(file.kind, |at| at.value);
     if kind == ErrorControlWord::Guarding
-        && let Some(heartbeat) = &file.heartbeat_ms
+        && let Some((source, heartbeat)) = heartbeat(context)
     {
-        let at = entry.error_control.as_ref().map(|at| (context.config, &at.span));
-        let (source, span) = at.unwrap_or((context.source, &heartbeat.span));
+        let own = entry.heartbeat_ms.is_some();
+        let at = entry.error_control.as_ref().filter(|_| !own).map(|at| (context.config, &at.span));
+        let (source, span) = at.unwrap_or((source, &heartbeat.span));
         let message = "the device is told to send heartbeats and cannot be guarded as well";
-        problems.error(source, span, message, "use `heartbeat`, or take `heartbeat_ms` out of the mapping");
+        let hint = if own {
+            "write `error_control = \"heartbeat\"`, or leave `heartbeat_ms` out"
+        } else {
+            "use `heartbeat`, or take `heartbeat_ms` out of the mapping"
+        };
+        problems.error(source, span, message, hint);
     }
     kind
+}
+
+/// The time after which a heartbeat is missed. One that is not longer than the time between two misses every one of them.
+fn heartbeat_timeout(problems: &mut Problems, context: &Context<'_>) -> Duration {
+    let (file, entry) = (&context.file.error_control, context.entry);
+    // The time-out of the mapping is meant for the heartbeat of the mapping.
+    let own = file.heartbeat_timeout_ms.as_ref().filter(|_| entry.heartbeat_ms.is_none());
+    let after = either(context, entry.heartbeat_timeout_ms.as_ref(), own);
+    let heartbeat = heartbeat(context).map(|(_, at)| at.value);
+    if let Some(((source, at), heartbeat)) =
+        after.zip(heartbeat).filter(|((_, at), every)| at.value <= *every)
+    {
+        let message =
+            format!("heartbeat_timeout_ms {} is not longer than heartbeat_ms {heartbeat}", at.value);
+        let hint = "give the time-out about three times the heartbeat, or leave it out";
+        problems.error(source, &at.span, message, hint);
+    }
+    let usual = Duration::from_millis(3 * heartbeat.map_or(500, |millis| millis.min(65_535)));
+    milliseconds(problems, after, "heartbeat_timeout_ms", 10..=65_535, usual)
 }
 
 fn byte(number: Option<u64>, default: u8) -> u8 {
@@ -309,6 +330,14 @@ pub fn checked_length(problems: &mut Problems, source: &SourceText, frame: &Fram
             let message = format!("`{}` is no mapped object", entry.value);
             problems.error(source, &entry.span, message, "write index, sub-index and bits: \"0x6130:1/32\"");
         }
+    }
+    if let (Some(at), Some(length)) = (frame.length, frame.length())
+        && at.value != length
+        && frame.maps.iter().all(|entry| mapped(&entry.value).is_some())
+    {
+        let message =
+            format!("`maps` of {} {} takes {length} bytes, not {}", frame.what, frame.key.value, at.value);
+        problems.error(source, &at.span, message, "leave `length` out: it follows from `maps`");
     }
     let span = frame.maps.first().map(|entry| &entry.span).or(frame.length.map(|at| &at.span));
     let Some((length, span)) = frame.length().zip(span) else {

@@ -3,15 +3,15 @@
 use std::time::Duration;
 
 use super::super::file::{MappingFile, MappingWord, OnStartWord, RpdoSection, TagSection, WrittenValue};
-use super::super::table::{Field, RpdoDef, Scale, Source, TagDef, WriteLimits};
-use super::super::{At, codec};
-use super::boot::mapping_mode;
+use super::super::table::{Field, FieldKind, RpdoDef, Scale, Source, TagDef, WriteLimits};
+use super::super::{At, SourceText, codec};
+use super::boot::{check_set_invalid, mapping_mode};
 use super::fields;
 use super::items::Item;
 use super::node::{self, Frame};
 use super::problems::Problems;
-use super::sync;
 use super::tags::Context;
+use super::{sync, writable};
 use crate::canopen::boot::{BootStep, PdoSetup};
 use crate::canopen::{NodeId, PdoIndex, Role, RpdoSettings, RpdoTrigger};
 use crate::process_image::Value;
@@ -65,13 +65,13 @@ pub fn settings(problems: &mut Problems, context: &Context<'_>, id: NodeId) -> V
     let settings: Vec<RpdoSettings> =
         context.rpdos.iter().map(|rpdo| one(problems, context, id, rpdo)).collect();
     let passive = context.bus.as_ref().is_some_and(|bus| bus.role == Role::Passive);
-    if context.entry.outputs && (settings.is_empty() || passive) {
+    if context.entry.outputs.value && (settings.is_empty() || passive) {
         let why = if passive { "the gateway is passive on its bus" } else { "its mapping has no [rpdo.N]" };
-        let at = &context.entry.mapping.span;
+        let at = &context.entry.outputs.span;
         let message = format!("`outputs = true` means nothing here: {why}");
         problems.warning(context.config, at, message, "leave `outputs` out");
     }
-    if context.entry.outputs { settings } else { Vec::new() }
+    if context.entry.outputs.value { settings } else { Vec::new() }
 }
 
 fn one(problems: &mut Problems, context: &Context<'_>, id: NodeId, rpdo: &Rpdo<'_>) -> RpdoSettings {
@@ -84,7 +84,7 @@ fn one(problems: &mut Problems, context: &Context<'_>, id: NodeId, rpdo: &Rpdo<'
             let kind = problems.within(source, at, "transmission_type", 0..=255);
             match u8::try_from(kind) {
                 Ok(every) if kind <= sync::LAST_SYNCHRONOUS => {
-                    if context.entry.outputs {
+                    if context.entry.outputs.value {
                         sync::check(problems, context, (source, at), &format!("RPDO {}", rpdo.number));
                     }
                     RpdoTrigger::Sync(every)
@@ -98,14 +98,22 @@ fn one(problems: &mut Problems, context: &Context<'_>, id: NodeId, rpdo: &Rpdo<'
             }
         }
     };
+    check_mapping(problems, source, rpdo);
     let refresh = match &section.refresh_ms {
         None => Some(1_000),
         Some(at) if at.value == 0 => None,
         Some(at) => Some(problems.within(source, at, "refresh_ms", 10..=3_600_000)),
     };
-    if let (RpdoTrigger::Sync(_), Some(at)) = (trigger, &section.refresh_ms) {
+    let timers = [(&section.refresh_ms, "refresh_ms"), (&section.inhibit_ms, "inhibit_ms")];
+    for (at, what) in timers.into_iter().filter(|_| matches!(trigger, RpdoTrigger::Sync(_))) {
+        if let Some(at) = at {
+            let message = format!("{what} means nothing for an RPDO that follows SYNC");
+            problems.error(source, &at.span, message, "leave it out, or use transmission type 255");
+        }
+    }
+    if let (RpdoTrigger::Sync(_), Some(at)) = (trigger, &section.inhibit_ms) {
         let hint = "leave it out, or use transmission type 255";
-        problems.error(source, &at.span, "refresh_ms means nothing for an RPDO that follows SYNC", hint);
+        problems.error(source, &at.span, "inhibit_ms means nothing for an RPDO that follows SYNC", hint);
     }
     let inhibit = problems.milliseconds(
         source,
@@ -124,12 +132,24 @@ fn one(problems: &mut Problems, context: &Context<'_>, id: NodeId, rpdo: &Rpdo<'
     }
 }
 
+/// What is sent is for the gateway to say, so that it cannot take it from the device.
+fn check_mapping(problems: &mut Problems, source: &SourceText, rpdo: &Rpdo<'_>) {
+    let section = rpdo.section;
+    if section.mapping.value == MappingWord::Adopt {
+        let message =
+            format!("RPDO {} cannot be adopted: the gateway must know what it sends", rpdo.key.value);
+        problems.error(source, &section.mapping.span, message, "use `write`, `verify` or `fixed`");
+    }
+    let mode = mapping_mode(section.mapping.value).filter(|_| !section.maps.is_empty());
+    check_set_invalid(problems, source, &section.set_pdo_invalid, mode);
+}
+
 /// How each RPDO is seen to before the node is started; nothing where it is sent none.
 pub fn steps(context: &Context<'_>) -> Vec<BootStep> {
-    let rpdos = context.rpdos.iter().enumerate().filter(|_| context.entry.outputs);
+    let rpdos = context.rpdos.iter().enumerate().filter(|_| context.entry.outputs.value);
     let step = |(place, rpdo): (usize, &Rpdo<'_>)| {
         let section = rpdo.section;
-        let mode = mapping_mode(section.mapping).filter(|_| !section.maps.is_empty())?;
+        let mode = mapping_mode(section.mapping.value).filter(|_| !section.maps.is_empty())?;
         Some(BootStep::Rpdo(PdoSetup {
             pdo: PdoIndex(place),
             number: u16::try_from(rpdo.number).unwrap_or_default(),
@@ -138,7 +158,7 @@ pub fn steps(context: &Context<'_>) -> Vec<BootStep> {
             transmission_type: section.transmission_type.as_ref().and_then(|at| u8::try_from(at.value).ok()),
             inhibit_time: None,
             event_timer: None,
-            set_invalid: section.set_pdo_invalid && section.mapping == MappingWord::Write,
+            set_invalid: section.set_pdo_invalid.value,
         }))
     };
     rpdos.filter_map(step).collect()
@@ -159,6 +179,7 @@ pub fn source(
         (section.poll_ms.as_ref().map(|at| &at.span), "poll_ms"),
         (section.unit_object.as_ref().map(|at| &at.span), "unit_object"),
         (section.digits_object.as_ref().map(|at| &at.span), "digits_object"),
+        (writable::asked(section).map(|at| &at.span), "writable"),
     ];
     for (span, what) in wrong {
         if let Some(span) = span {
@@ -201,9 +222,14 @@ fn first_bit(
     match (&section.bit, &section.object) {
         (Some(bit), None) => bit.clone(),
         (None, Some(object)) => {
-            let found =
-                node::object(problems, source, object).and_then(|id| node::bit_of(&rpdo?.section.maps, id));
-            if found.is_none() && rpdo.is_some() {
+            fields::refuse_array(problems, source, section);
+            let id = node::object(problems, source, object);
+            let mapped = rpdo.map(|rpdo| &rpdo.section.maps).zip(id);
+            if let Some((maps, id)) = mapped {
+                fields::check_width(problems, source, section, (object, id), maps);
+            }
+            let found = mapped.and_then(|(maps, id)| node::bit_of(maps, id));
+            if found.is_none() && mapped.is_some() {
                 let message = format!("the RPDO does not map {}", object.value);
                 problems.error(source, &object.span, message, "add it to `maps`, or write `bit`");
             }
@@ -217,7 +243,8 @@ fn first_bit(
     }
 }
 
-fn limits(
+/// What can be written to a tag.
+pub fn limits(
     problems: &mut Problems,
     context: &Context<'_>,
     item: &Item<'_>,
@@ -228,6 +255,13 @@ fn limits(
     let minimum = number(&section.minimum, f64::NEG_INFINITY);
     let maximum = number(&section.maximum, f64::INFINITY);
     let mut limits = WriteLimits { default: None, minimum, maximum };
+    let bounds = [(&section.minimum, "minimum"), (&section.maximum, "maximum")];
+    for (at, what) in bounds.into_iter().filter(|_| field.kind == FieldKind::Bool) {
+        if let Some(at) = at {
+            let message = format!("`{}` is a bit, so `{what}` means nothing", item.name);
+            problems.error(context.source, &at.span, message, "leave it out");
+        }
+    }
     let wrong = minimum.partial_cmp(&maximum).is_none_or(std::cmp::Ordering::is_gt);
     if let Some(at) = section.minimum.as_ref().or(section.maximum.as_ref()).filter(|_| wrong) {
         let message = format!("no value of `{}` lies between {minimum} and {maximum}", item.name);
@@ -256,14 +290,20 @@ fn limits(
     limits
 }
 
-/// Keys that are for tags of an RPDO only.
+/// Keys that are for tags that can be written.
 pub fn refuse_limits(problems: &mut Problems, context: &Context<'_>, section: &TagSection) {
     let default = section.default.as_ref().map(|at| (&at.span, "default"));
     let minimum = section.minimum.as_ref().map(|at| (&at.span, "minimum"));
     let maximum = section.maximum.as_ref().map(|at| (&at.span, "maximum"));
-    for (span, what) in [default, minimum, maximum].into_iter().flatten() {
+    let writable = writable::asked(section).map(|at| (&at.span, "writable"));
+    for (span, what) in [default, minimum, maximum, writable].into_iter().flatten() {
         let message = format!("`{what}` means nothing for a tag that the device sends");
-        problems.error(context.source, span, message, "it is for tags with `rpdo`; leave it out");
+        let hint = match what {
+            "writable" => "it is for tags with `object`; leave it out",
+            "default" => "it is for tags with `rpdo`; leave it out",
+            _ => "it is for tags with `rpdo`, and for objects with `writable = true`; leave it out",
+        };
+        problems.error(context.source, span, message, hint);
     }
 }
 

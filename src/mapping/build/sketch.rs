@@ -68,6 +68,7 @@ impl Sketch {
             buses: &BTreeMap::from([(At::nowhere(BUS.to_owned()), self.bus.clone())]),
             nodes: &self.nodes,
             mappings: &self.mappings,
+            listeners: &[],
             lost: &[],
         })
     }

@@ -17,7 +17,7 @@ use super::node::Tpdo;
 use super::order::causes_first;
 use super::problems::{Problems, matched};
 use super::rpdo::Rpdo;
-use super::{derived, emergency, fields, node, rpdo, units};
+use super::{derived, emergency, esd, fields, node, rpdo, units, writable};
 use crate::process_image::{NodeIndex, TagIndex};
 
 /// Lowest register address of device data; below are those of the node itself.
@@ -180,6 +180,7 @@ fn parameter(
         decimals: 0,
         source: Source::Derived(Derived::Constant { value: value.value }),
         object: None,
+        writable: None,
         valid: None,
         doubtful: None,
         registers: Vec::new(),
@@ -192,16 +193,25 @@ fn from_pdo(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, sec
     if let Some((part, field)) = emergency::source(problems, context, item, section) {
         refuse_bits(problems, context, item, ("comes from emergency messages", "change it in the mapping"));
         rpdo::refuse_limits(problems, context, section);
+        units::refuse_device_unit(problems, context, item, section, "comes from emergency messages");
         let scale = scale(problems, context, section.scale.as_ref());
         let usual_decimals = if scale == Scale::IDENTITY { 0 } else { 2 };
         let source = Source::Emergency { part, field, scale };
         return finished(problems, context, item, section.shared(), usual_decimals, source);
     }
+    if let Some((carrier, field)) = esd::source(problems, context, item, section) {
+        refuse_bits(problems, context, item, ("is told by the module", "change it in the mapping"));
+        rpdo::refuse_limits(problems, context, section);
+        let scale = scale(problems, context, section.scale.as_ref());
+        let usual_decimals = if scale == Scale::IDENTITY { 0 } else { 2 };
+        let source = Source::Module { carrier, field, scale };
+        return finished(problems, context, item, section.shared(), usual_decimals, source);
+    }
     let scale = scale(problems, context, section.scale.as_ref());
     let mut source = if let Some(rpdo) = &section.rpdo {
+        units::refuse_device_unit(problems, context, item, section, "is sent in an RPDO");
         rpdo::source(problems, context, item, section, rpdo, scale)
     } else {
-        rpdo::refuse_limits(problems, context, section);
         let (pdo, field) = fields::field(problems, context, item, section);
         let poll = fields::poll(context, item).zip(fields::whole(section));
         match (node::adopted(context, section), poll) {
@@ -229,7 +239,9 @@ fn from_pdo(problems: &mut Problems, context: &Context<'_>, item: &Item<'_>, sec
     let tag = finished(problems, context, item, section.shared(), usual_decimals, source);
     // One that cannot be read was told of with its place.
     let object = section.object.as_ref().and_then(|object| object.value.parse().ok());
-    TagDef { device_unit, object, ..tag }
+    let source = (&tag.source, object, device_unit.as_ref());
+    let limits = received.then(|| writable::limits(problems, context, item, section, source)).flatten();
+    TagDef { device_unit, object, writable: limits, ..tag }
 }
 
 /// What the installation changes of the bits of a tag.
@@ -313,6 +325,7 @@ fn finished(
         decimals: decimals.and_then(|decimals| u8::try_from(decimals).ok()).unwrap_or(usual_decimals),
         source,
         object: None,
+        writable: None,
         valid: keys.valid.and_then(|valid| context.bool_tag(problems, valid, &item.element, "`valid`")),
         doubtful: keys.doubtful.and_then(|tag| context.bool_tag(problems, tag, &item.element, "`doubtful`")),
         registers: places(problems, context, item, keys),
@@ -341,7 +354,7 @@ fn places(
         let hint = "bits 128 to 191 show the node's alarms; use another address";
         problems.error(context.source, &bit.span, format!("bit address {address} is taken"), hint);
     }
-    places.extend(address_of(problems, context, bit, item, 1).map(|address| RegisterDef {
+    places.extend(address_of(problems, context, bit, item, [1, 1]).map(|address| RegisterDef {
         space: Space::Bit,
         address,
         encoding: Encoding::Bool,
@@ -386,7 +399,11 @@ fn place(
         let message = format!("register {} belongs to the node itself", register.address.value);
         problems.error(context.source, &register.address.span, message, "use addresses from 100 on");
     }
-    let address = address_of(problems, context, &register.address, item, encoding.count())?;
+    let count = u64::from(encoding.count());
+    let stride = register.stride.as_ref().map_or(count, |stride| {
+        problems.within(context.source, stride, "stride", count..=u64::from(u16::MAX))
+    });
+    let address = address_of(problems, context, &register.address, item, [count, stride])?;
     let resolution = register.resolution.as_ref().map_or(1.0, |resolution| resolution.value);
     Some(RegisterDef { space: Space::Register, address, encoding, resolution })
 }
@@ -403,16 +420,16 @@ fn encoding(word: EncodingWord) -> Encoding {
     }
 }
 
-/// The address of an element of an array, if it stays below 65536.
+/// The address of an element of an array, if it stays below 65536. An element takes `count`, the next is `stride` further.
 fn address_of(
     problems: &mut Problems,
     context: &Context<'_>,
     address: &At<u64>,
     item: &Item<'_>,
-    count: u16,
+    [count, stride]: [u64; 2],
 ) -> Option<u16> {
-    let first = address.value.saturating_add(item.element.index.saturating_mul(u64::from(count)));
-    let last = first.saturating_add(u64::from(count) - 1);
+    let first = address.value.saturating_add(item.element.index.saturating_mul(stride));
+    let last = first.saturating_add(count - 1);
     if last > u64::from(u16::MAX) {
         let message = format!("address {last} of `{}` is above 65535", item.name);
         problems.error(context.source, &address.span, message, "use a lower address");

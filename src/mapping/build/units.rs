@@ -60,6 +60,25 @@ pub fn device_unit(
     (unit.is_some() || digits.is_some()).then_some(DeviceUnit { unit, digits, target })
 }
 
+/// Only what is read of the device has a unit that the device chooses.
+pub fn refuse_device_unit(
+    problems: &mut Problems,
+    context: &Context<'_>,
+    item: &Item<'_>,
+    section: &TagSection,
+    why: &str,
+) {
+    if section.unit == DEVICE_UNIT {
+        let message = format!("`{}` {why}, so it is not in the device's unit", item.name);
+        problems.error(
+            context.source,
+            &item.span,
+            message,
+            "write the unit that it has, or leave `unit` out",
+        );
+    }
+}
+
 /// What values are converted to; `None`: they stay as they are.
 fn target(
     problems: &mut Problems,

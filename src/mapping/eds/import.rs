@@ -1,6 +1,7 @@
 //! From an EDS or DCF to the text of a device mapping.
 
-use super::former::{BEGIN, Chunk, END, Former, Part};
+use super::chunk::{Chunk, Part};
+use super::former::{BEGIN, END, Former};
 use super::model::Eds;
 use super::pdo::{Tpdo, tpdos};
 use super::report::{Place, Report};

@@ -3,12 +3,15 @@
 //! - [`read()`]: bytes to an [`Eds`], with a warning for everything that is not as the standard has it. Its parts: `charset`,
 //!   `ini`, `number`, `sections`, `objects`.
 //! - [`import()`]: an [`Eds`] to the text of a mapping; with the former text of the same mapping, addresses and what was
-//!   written by hand stay. Its parts: `pdo` (what the TPDOs carry), `naming`, `addresses`, `former` (the former text),
-//!   `tags`, `setup`, `writer`.
+//!   written by hand stay. Its parts: `pdo` (what the TPDOs carry), `naming`, `addresses`, `former` (the former text) and
+//!   `chunk` (one table of it), `tags`, `setup`, `writer`.
+//! - [`dcf()`]: an [`Eds`] and what a node is set to, to the DCF of that node.
 //! - [`model`]: what an EDS says. [`report`]: where messages are collected.
 
 mod addresses;
 mod charset;
+mod chunk;
+mod dcf;
 mod former;
 pub mod import;
 mod ini;
@@ -24,6 +27,7 @@ mod setup;
 mod tags;
 mod writer;
 
+pub use dcf::{Commissioning, configured, dcf};
 pub use import::{Imported, import};
 pub use model::{Access, DataType, DeviceInfo, Eds, Object, ObjectId, Value};
 pub use read::read;

@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use super::former::{Chunk, Former, Part, text};
+use super::chunk::{Chunk, Part, text};
+use super::former::Former;
 use super::model::{DataType, Eds, ObjectId};
 use super::naming::title;
 use super::pdo::{Mapped, Tpdo};

@@ -1,6 +1,7 @@
 //! The tables of a mapping that come from an EDS, other than its tags, as text.
 
-use super::former::{Chunk, Former, Part, text};
+use super::chunk::{Chunk, Part, text};
+use super::former::Former;
 use super::model::{Eds, ObjectId};
 use super::pdo::Tpdo;
 use super::report::{Place, Report};
@@ -10,7 +11,7 @@ use super::setup;
 const HEARTBEAT_MS: u64 = 1000;
 /// Shortest time-out of a heartbeat, in ms.
 const SHORTEST_TIMEOUT_MS: u64 = 500;
-/// Longest time-out of a heartbeat, in ms.
+/// Longest time-out of a heartbeat, in ms; the heartbeat itself must be shorter.
 const LONGEST_TIMEOUT_MS: u64 = 65_535;
 
 /// A text in quotation marks, as TOML has it.
@@ -81,7 +82,7 @@ pub fn error_control(eds: &Eds, former: &Former) -> String {
         // Two lost in a row, and a half more for their delay; a busy host may be late by more than a fast heartbeat.
         let timeout = (heartbeat * 5 / 2).clamp(SHORTEST_TIMEOUT_MS, LONGEST_TIMEOUT_MS);
         lines.push("kind = \"heartbeat\"".to_owned());
-        lines.push(format!("heartbeat_ms = {}", heartbeat.min(LONGEST_TIMEOUT_MS)));
+        lines.push(format!("heartbeat_ms = {}", heartbeat.min(LONGEST_TIMEOUT_MS - 1)));
         lines.push(format!("heartbeat_timeout_ms = {timeout}"));
     } else if object(0x100C).is_some() && object(0x100D).is_some() {
         lines.push("kind = \"guarding\"".to_owned());

@@ -67,7 +67,7 @@ pub struct StartSection {
 pub struct TpdoSection {
     /// Its identifier: `"$NODEID+0x180"`, or a number; one above 0x7FF is a 29-bit identifier.
     pub cob_id: At<CobId>,
-    /// Bytes that it has, 1..=8; a shorter frame is discarded. Follows from `maps` where that is given.
+    /// Bytes that it has, 1..=8; a shorter frame is discarded. Follows from `maps` where that is given, and must agree with it.
     pub length: Option<At<u64>>,
     /// What it carries, in order, each `"0xINDEX:SUB/BITS"`, for example `"0x6130:1/32"`.
     #[serde(default)]
@@ -83,9 +83,9 @@ pub struct TpdoSection {
     pub event_timer_ms: Option<At<u64>>,
     /// Inhibit time in microseconds, 0..=6553500 in steps of 100, written where it differs. Absent: as the node has it.
     pub inhibit_time_us: Option<At<u64>>,
-    /// Mark the PDO as not valid while its mapping is changed. Default: false.
+    /// Mark the PDO as not valid while its mapping is changed; only where it is. Default: false.
     #[serde(default)]
-    pub set_pdo_invalid: bool,
+    pub set_pdo_invalid: At<bool>,
     /// Time between two frames when nothing happens, 1..=3600000.
     pub period_ms: Option<At<u64>>,
     /// Shortest time between two frames that the device is known to keep, 1..=3600000; a much faster rate is suspicious.
@@ -106,28 +106,28 @@ pub struct TpdoSection {
 pub struct RpdoSection {
     /// Its identifier: `"$NODEID+0x200"`, or a number; one above 0x7FF is a 29-bit identifier.
     pub cob_id: At<CobId>,
-    /// Bytes that it has, 1..=8. Follows from `maps` where that is given.
+    /// Bytes that it has, 1..=8. Follows from `maps` where that is given, and must agree with it.
     pub length: Option<At<u64>>,
     /// What it carries, in order, each `"0xINDEX:SUB/BITS"`.
     #[serde(default)]
     pub maps: Vec<At<String>>,
-    /// What is done where the node has another mapping: with `verify` nothing is sent. Default: write; without `maps` nothing
-    /// is read or written.
+    /// What is done where the node has another mapping: with `verify` nothing is sent; not `adopt`. Default: write; without
+    /// `maps` nothing is read or written.
     #[serde(default)]
-    pub mapping: MappingWord,
+    pub mapping: At<MappingWord>,
     /// 254 and 255: sent when it changes; 1..=240: after every so many SYNCs; 0: after the next SYNC when it changed. With
     /// `maps` written where it differs. Default: 255, and as the node has it.
     pub transmission_type: Option<At<u64>>,
     /// Sent again after this long without a change, 10..=3600000; 0 = not. Default: 1000.
     pub refresh_ms: Option<At<u64>>,
-    /// At least this long between two frames, 0..=65535. Default: 10.
+    /// At least this long between two frames, 0..=65535; not with SYNC. Default: 10.
     pub inhibit_ms: Option<At<u64>>,
     /// What is sent when the node takes part again. Default: default.
     #[serde(default)]
     pub on_start: OnStartWord,
-    /// Mark the PDO as not valid while its mapping is changed. Default: false.
+    /// Mark the PDO as not valid while its mapping is changed; only where it is. Default: false.
     #[serde(default)]
-    pub set_pdo_invalid: bool,
+    pub set_pdo_invalid: At<bool>,
 }
 
 /// What an RPDO begins with when its node takes part again.
@@ -162,7 +162,7 @@ pub enum MappingWord {
     /// It is changed in the node.
     #[default]
     Write,
-    /// It is told, and its values are withheld.
+    /// It is told, and the values of another content are withheld; another transmission type or timer is told only.
     Verify,
     /// Nothing is read or written: the file is believed.
     Fixed,

@@ -3,11 +3,12 @@
 //! Numbers are read wide and names as text; [`build`](super::build()) checks them, so that all problems are told at once.
 //!
 //! - `canopen`: what the gateway does as master of the device. `tags`: entries that make tags. `alarms`: entries about
-//!   alarms. `emergency`: what emergency messages mean. [`values`]: values that can be written in more than one way.
+//!   alarms. `emergency`: what emergency messages mean. `esd`: what is said of esd modules. [`values`]: values that can be written in more than one way.
 
 mod alarms;
 mod canopen;
 mod emergency;
+mod esd;
 mod tags;
 pub mod values;
 
@@ -24,6 +25,7 @@ pub use canopen::{
     StartSection, TpdoSection,
 };
 pub use emergency::{EmergencySection, EmergencyWord, ErrorSection};
+pub use esd::{EsdSection, ModuleKindWord, ModuleWord};
 pub use tags::*;
 
 /// A device mapping.
@@ -35,6 +37,8 @@ pub struct MappingFile {
     pub format: At<u64>,
     /// What device it is.
     pub device: DeviceSection,
+    /// Says that it is an esd module for serial lines, which speaks no CANopen.
+    pub esd: Option<EsdSection>,
     /// What it says of itself; a node that says otherwise is not started.
     pub identity: Option<IdentitySection>,
     /// How its life is watched.

@@ -6,6 +6,7 @@ use serde::Deserialize;
 use super::super::At;
 use super::super::installation::ByteOrderWord;
 use super::emergency::EmergencyWord;
+use super::esd::ModuleWord;
 use super::values::NameList;
 
 /// An entry that makes tags: keys of its own among those that all such entries share.
@@ -105,16 +106,22 @@ tag_entry! {
         pub bit: Option<At<u64>>,
         /// What is sent before anything was written; tags of an RPDO only. Default: nothing is sent before.
         pub default: Option<At<WrittenValue>>,
-        /// Lowest value that can be written; tags of an RPDO only. Default: what its type can hold.
+        /// Lowest value that can be written; tags of an RPDO and with `writable`. Default: what its type can hold.
         pub minimum: Option<At<f64>>,
-        /// Highest value that can be written; tags of an RPDO only. Default: what its type can hold.
+        /// Highest value that can be written; tags of an RPDO and with `writable`. Default: what its type can hold.
         pub maximum: Option<At<f64>>,
         /// The object that it is, `"0xINDEX:SUB"`: taken from the TPDO that maps it, else read every `poll_ms`.
         pub object: Option<At<String>>,
         /// How often an object that no TPDO maps is read by SDO, 100..=86400000.
         pub poll_ms: Option<At<u64>>,
+        /// It may be written by SDO, by clients whose `[access.NAME]` lists it; tags with `object` only. Default: false.
+        pub writable: Option<At<bool>>,
         /// What of the emergency messages it shows, instead of `tpdo` and `bit` or `object`.
         pub emergency: Option<At<EmergencyWord>>,
+        /// What of an esd module it shows, instead of all these.
+        pub module: Option<At<ModuleWord>>,
+        /// The number of the serial line that `module` means; that of the first of an array.
+        pub channel: Option<At<u64>>,
         /// `bool`, `u1`..`u64`, `i2`..`i64`, `f32` or `f64`.
         #[serde(rename = "type")]
         #[schemars(regex(pattern = r"^(bool|f32|f64|[ui]([1-9]|[1-5][0-9]|6[0-4]))$"))]
@@ -170,6 +177,8 @@ pub struct RegisterSection {
     /// How the value is written there.
     #[serde(rename = "type")]
     pub encoding: At<EncodingWord>,
+    /// Registers from one element of an array to the next. Default: those that one takes.
+    pub stride: Option<At<u64>>,
     /// Engineering units per count, for u16, i16, u32 and i32. Default: 1.
     pub resolution: Option<At<f64>>,
 }

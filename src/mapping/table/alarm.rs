@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::super::expression::Expression;
 use crate::can::BusIndex;
 use crate::canopen::emcy;
-use crate::process_image::{NodeIndex, Priority, TagIndex, Value};
+use crate::process_image::{NodeIndex, Priority, SessionTrouble, TagIndex, Value};
 
 /// An alarm.
 #[derive(Clone, Debug, PartialEq)]
@@ -40,7 +40,8 @@ pub struct AlarmDef {
 }
 
 impl AlarmDef {
-    /// What it means, in the words for the operator: with the error code, where one raised it.
+    /// What it means, in the words for the operator: with the error code, where one raised it; with the reason why there is no
+    /// MQTT session.
     #[must_use]
     pub fn told(&self, value: Option<Value>) -> Cow<'_, str> {
         let of_error =
@@ -49,6 +50,10 @@ impl AlarmDef {
             Some(Value::Unsigned(code)) if of_error => {
                 let meaning = u16::try_from(code).map_or("", emcy::meaning);
                 Cow::Owned(format!("{} Error code 0x{code:04X} ({meaning}).", self.text))
+            }
+            Some(Value::Unsigned(code)) if self.condition == AlarmCondition::BuiltIn(BuiltIn::MqttDown) => {
+                let why = SessionTrouble::of_code(code).map_or("", SessionTrouble::meaning);
+                Cow::Owned(format!("{} {why}", self.text))
             }
             _ => Cow::Borrowed(&self.text),
         }
@@ -80,6 +85,20 @@ pub enum AlarmCondition {
 pub enum BuiltIn {
     /// G01: no MQTT session.
     MqttDown,
+    /// G02: what is kept for the broker fills four fifths of its room.
+    BufferFilling,
+    /// G03: the disk that it is kept on cannot be used.
+    BufferFault,
+    /// G05: a new configuration was refused; that before goes on.
+    ConfigurationRejected,
+    /// G06: a certificate expires within a month.
+    CertificateExpires,
+    /// G06: within a week.
+    CertificateExpiresSoon,
+    /// G06: it has.
+    CertificateExpired,
+    /// G07: requests were refused for want of a right, again and again.
+    AccessRefused,
     /// B01: the controller is off the bus.
     BusOff,
     /// B02: the interface is missing or down.
@@ -120,4 +139,6 @@ pub enum BuiltIn {
     NamedError(usize),
     /// R-DET-043: somebody else guards this node.
     ForeignGuardMaster,
+    /// An esd module is not as the configuration wants it, and cannot be made so.
+    NotConfigured,
 }

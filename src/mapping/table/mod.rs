@@ -3,28 +3,37 @@
 //! Made once from the mapping files and the installation's nodes; the gateway, the register map and the topics are
 //! all built from it, so that they cannot disagree.
 //!
-//! - `tag`: tags and their places in the register map. `device_unit`: units that the device tells.
+//! - `tag`: tags and their places in the register map; `writing`: which of them can be written. `device_unit`: units that the device tells.
+//! - `protocol`: what a node speaks. `module`, `line`: esd modules and their serial lines.
 //! - `derived`: computed tags. `alarm`: alarms. `emergency`: errors that emergency messages tell of.
 
 mod alarm;
 mod derived;
 mod device_unit;
 mod emergency;
+mod line;
+mod module;
+mod protocol;
 mod tag;
+mod writing;
 
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::time::Duration;
 
 use crate::can::BusIndex;
-use crate::canopen::{NodeSettings, OwnHeartbeatSettings, Role, SyncSettings, TimeSettings};
-use crate::process_image::{NodeIndex, TagIndex};
+use crate::canopen::{NodeSettings, OwnHeartbeatSettings, PdoSettings, Role, SyncSettings, TimeSettings};
+use crate::process_image::{LineIndex, NodeIndex, TagIndex};
 
 pub use alarm::*;
 pub use derived::*;
 pub use device_unit::*;
 pub use emergency::*;
+pub use line::*;
+pub use module::*;
+pub use protocol::*;
 pub use tag::*;
+pub use writing::*;
 
 /// Everything that an installation has.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -39,6 +48,8 @@ pub struct TagTable {
     pub tags: Vec<TagDef>,
     /// By [`AlarmIndex`](crate::process_image::AlarmIndex): the gateway's, then the buses', then each node's; a cause before what it suppresses.
     pub alarms: Vec<AlarmDef>,
+    /// By [`LineIndex`]: the serial lines of the modules that are used, those of a module together.
+    pub lines: Vec<LineDef>,
 }
 
 impl TagTable {
@@ -68,6 +79,12 @@ impl TagTable {
         Some(TagIndex(range.start + offset))
     }
 
+    /// The definition of a serial line.
+    #[must_use]
+    pub fn line(&self, line: LineIndex) -> Option<&LineDef> {
+        self.lines.get(line.0)
+    }
+
     /// The node of a name.
     #[must_use]
     pub fn find_node(&self, name: &str) -> Option<NodeIndex> {
@@ -92,6 +109,16 @@ pub struct BusDef {
     pub time: Option<TimeSettings>,
     /// The gateway's own heartbeat, where it sends one.
     pub own_heartbeat: Option<OwnHeartbeatSettings>,
+    /// What its esd modules have in common.
+    pub esd: EsdBusDef,
+}
+
+impl BusDef {
+    /// The gateway sends nothing there.
+    #[must_use]
+    pub fn is_passive(&self) -> bool {
+        self.role == Role::Passive
+    }
 }
 
 /// A node.
@@ -101,8 +128,8 @@ pub struct NodeDef {
     pub name: String,
     /// Its bus.
     pub bus: BusIndex,
-    /// What the CANopen master needs to know, PDOs included.
-    pub canopen: NodeSettings,
+    /// What it speaks, and what its manager needs to know, PDOs included.
+    pub protocol: Protocol,
     /// The device type.
     pub device: DeviceDef,
     /// Modbus unit id, 1..=247.
@@ -121,7 +148,7 @@ pub struct NodeDef {
     pub alarms: Range<usize>,
     /// RPDOs of its mapping, by their numbers.
     pub rpdos: Vec<RpdoDef>,
-    /// The configuration allows that it is sent RPDOs: only then [`canopen`](Self::canopen) has them, at the same places.
+    /// The configuration allows that it is sent RPDOs: only then [`protocol`](Self::protocol) has them, at the same places.
     pub outputs: bool,
     /// Reserved bits of each PDO, by [`PdoIndex`](crate::canopen::PdoIndex): a set one is counted (R-DET-052).
     pub reserved_bits: Vec<u64>,
@@ -129,6 +156,35 @@ pub struct NodeDef {
     pub emergency: EmergencyDef,
     /// How often the MQTT state topic is published.
     pub publish: PublishDef,
+}
+
+impl NodeDef {
+    /// Settings of a CANopen node.
+    #[must_use]
+    pub fn canopen(&self) -> Option<&NodeSettings> {
+        self.protocol.canopen()
+    }
+
+    /// TPDOs; a module has none.
+    #[must_use]
+    pub fn pdos(&self) -> &[PdoSettings] {
+        self.protocol.pdos()
+    }
+
+    /// Node id, or module number.
+    #[must_use]
+    pub fn number(&self) -> u8 {
+        self.protocol.number()
+    }
+
+    /// Whether a value is asked for, or comes by itself: what a module tells of itself does not where it is not managed.
+    #[must_use]
+    pub fn is_asked_for(&self, source: &Source) -> bool {
+        match (source, self.protocol.module()) {
+            (Source::Module { carrier, .. }, Some(module)) => *carrier < ModuleCarrier::told(module),
+            _ => true,
+        }
+    }
 }
 
 /// An RPDO of a mapping.

@@ -26,6 +26,8 @@ pub struct TagDef {
     pub source: Source,
     /// The object of the device that it is, where the mapping says so.
     pub object: Option<ObjectId>,
+    /// What can be written to that object, where the mapping lets it be written by SDO.
+    pub writable: Option<WriteLimits>,
     /// A bool tag of the same node that tells whether the value means anything (R-DET-086).
     pub valid: Option<TagIndex>,
     /// A bool tag of the same node that is true while the value is to be used with a reservation (R-DST-026).
@@ -89,6 +91,15 @@ pub enum Source {
         scale: Scale,
         /// What can be written.
         limits: WriteLimits,
+    },
+    /// A value of an esd module, or of one of its serial lines.
+    Module {
+        /// Which, by its place: [`ModuleCarrier`](super::ModuleCarrier).
+        carrier: usize,
+        /// Which bits of it, and how they are read.
+        field: Field,
+        /// From raw to engineering units.
+        scale: Scale,
     },
     /// Computed from other tags of the node.
     Derived(Derived),

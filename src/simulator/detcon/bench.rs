@@ -3,7 +3,7 @@
 use super::super::slave::SlaveFaults;
 use super::faults::Faults;
 use super::protocol::{Detcon, DetconSettings};
-use super::values::Values;
+use super::values::{Channel, Values};
 use crate::canopen::NodeId;
 use crate::time::Now;
 
@@ -116,6 +116,19 @@ impl Bench {
         self.run_to(millis + 1);
         self.take().into_iter().find_map(|(_, frame)| frame.strip_prefix("701#").map(str::to_owned))
     }
+}
+
+pub fn healthy() -> DetconSettings {
+    DetconSettings::default()
+}
+
+pub fn channel(number: u8) -> Channel {
+    Channel::new(number).unwrap()
+}
+
+/// Frames with their times, as the log has them.
+pub fn sent(frames: &[(u64, &str)]) -> Vec<(u64, String)> {
+    frames.iter().map(|(at, frame)| (*at, (*frame).to_owned())).collect()
 }
 
 /// Like [`DetconSettings::default`], but all TPDOs start at the start command, to the millisecond.

@@ -270,7 +270,7 @@ mod tests {
     #[test]
     fn a_line_can_name_one_of_several_devices() {
         let order: Order = "  node 2   power on ".parse().unwrap();
-        assert_eq!(order.node, NodeId::new(2));
+        assert_eq!(order.node, NodeId::new(2).map(Into::into));
         assert_eq!(parse(&order.words()), Ok(Control::Slave(SlaveOrder::Power(true))));
     }
 
@@ -288,7 +288,7 @@ mod tests {
             ("set nothing 1", "analog_output"),
             ("set knock_intensity_21 1", "from 1 to 20"),
             ("set engine_knocking 1", "knock"),
-            ("node 128 trip", "1 to 127"),
+            ("node 255 trip", "1 to 254"),
             ("node 1 node 1 trip", "help"),
         ] {
             let error = control(line).unwrap_err();

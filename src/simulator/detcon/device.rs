@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::super::device::{Device, DevicePlan, Status};
+use super::super::device::{Device, DeviceNumber, DevicePlan, Status};
 use super::super::scenario::Player;
 use super::super::slave::{SlaveFaults, SlaveOrder};
 use super::control::{self, Control, Point};
@@ -11,7 +11,7 @@ use super::faults::Faults;
 use super::protocol::{Detcon, DetconSettings};
 use super::values::{StatusBit, Tpdo};
 use crate::can::{CanFrame, CanId};
-use crate::canopen::{NodeId, cob_id};
+use crate::canopen::cob_id;
 use crate::time::{Instant, Now};
 
 /// A device with its engine and its story.
@@ -30,7 +30,7 @@ impl SimulatedDetcon {
     pub fn power_on(plan: &DevicePlan, settings: &DetconSettings, now: Now) -> Self {
         let mut device = Self {
             settings: settings.clone(),
-            detcon: Detcon::new(plan.node, settings.clone()),
+            detcon: Detcon::new(plan.node.node_id(), settings.clone()),
             engine: Engine::new(settings.cylinders, plan.seed, now.instant),
             player: Player::new(&plan.scenario, now.instant + plan.story_after),
             overrides: BTreeMap::new(),
@@ -83,8 +83,8 @@ impl SimulatedDetcon {
 }
 
 impl Device for SimulatedDetcon {
-    fn node(&self) -> NodeId {
-        self.detcon.node()
+    fn node(&self) -> DeviceNumber {
+        self.detcon.node().into()
     }
 
     fn status(&self) -> Status {
@@ -95,7 +95,7 @@ impl Device for SimulatedDetcon {
     }
 
     fn hears(&self, id: CanId) -> bool {
-        id == cob_id::NMT || id == cob_id::error_control(self.node())
+        id == cob_id::NMT || id == cob_id::error_control(self.detcon.node())
     }
 
     fn handle_frame(&mut self, now: Now, frame: &CanFrame) {

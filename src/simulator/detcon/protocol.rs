@@ -362,5 +362,8 @@ impl Detcon {
 }
 
 #[cfg(test)]
+#[path = "protocol_fault_tests.rs"]
+mod fault_tests;
+#[cfg(test)]
 #[path = "protocol_tests.rs"]
 mod tests;

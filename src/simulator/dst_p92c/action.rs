@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::super::order::{millis, switch, switched_off, unknown, unless_off};
+use super::super::order::{self, millis, switch, switched_off, unknown, unless_off};
 use super::super::sdo_server::Abort;
 use super::super::slave::SlaveOrder;
 use super::object_table::{Entry, Key, Type, find};
@@ -98,7 +98,7 @@ pub fn parse(words: &[&str]) -> Result<Action, String> {
             let entry = entry(key)?;
             Action::Set(key, unless_off(value, |value| parse_value(entry, value))?)
         }
-        ["bus", kbit] => Action::Bus(parse_kbit(kbit)?),
+        ["bus", kbit] => Action::Bus(order::kbit(kbit)?),
         ["clear", "all"] => Action::ClearAll,
         _ => return Err(unknown()),
     })
@@ -188,12 +188,6 @@ fn parse_voice(word: &str) -> Result<Voice, String> {
         "pdo" => Ok(Voice::Pdo),
         other => Err(format!("`{other}` cannot be muted; there are sdo, heartbeat, emcy and pdo")),
     }
-}
-
-fn parse_kbit(word: &str) -> Result<u16, String> {
-    const USUAL: [u16; 10] = [0, 10, 20, 50, 100, 125, 250, 500, 800, 1000];
-    let kbit = word.parse().ok().filter(|kbit| USUAL.contains(kbit));
-    kbit.ok_or_else(|| format!("`{word}` is not a bit rate in kbit/s; give 10 to 1000, or 0 for any"))
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::super::device::{Device, DevicePlan, Status};
+use super::super::device::{Device, DeviceNumber, DevicePlan, Status};
 use super::super::scenario::Player;
 use super::super::slave::{SlaveFaults, SlaveOrder};
 use super::action::{self, Action, Voice};
@@ -12,7 +12,7 @@ use super::protocol::DstP92c;
 use super::services::LSS_REQUEST;
 use super::settings::DstSettings;
 use crate::can::{CanFrame, CanId};
-use crate::canopen::{NodeId, cob_id};
+use crate::canopen::cob_id;
 use crate::time::{Instant, Now};
 
 /// A device with its plant and its story.
@@ -28,7 +28,7 @@ impl SimulatedDst {
     #[must_use]
     pub fn power_on(plan: &DevicePlan, settings: &DstSettings, now: Now) -> Self {
         let mut device = Self {
-            dst: DstP92c::new(plan.node, settings.clone()),
+            dst: DstP92c::new(plan.node.node_id(), settings.clone()),
             plant: Hydraulics::new(settings, plan.seed, now.instant),
             player: Player::new(&plan.scenario, now.instant + plan.story_after),
         };
@@ -111,8 +111,8 @@ fn switch_fault(faults: &mut Faults, action: Action) {
 }
 
 impl Device for SimulatedDst {
-    fn node(&self) -> NodeId {
-        self.dst.node()
+    fn node(&self) -> DeviceNumber {
+        self.dst.node().into()
     }
 
     fn status(&self) -> Status {

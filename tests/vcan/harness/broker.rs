@@ -8,35 +8,61 @@ use std::time::Instant;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::process::{Process, free_port, run};
+use super::process::{Process, free_port};
 use super::wait::{wait_for, wait_until};
 
 /// mosquitto on a port of its own.
 pub struct Broker {
     /// Where it listens.
     pub port: u16,
+    /// The network namespace that it and its clients are in; `None` = that of the test.
+    namespace: Option<&'static str>,
     folder: TempDir,
     process: Process,
+}
+
+/// A program, in a network namespace where one is named.
+fn program(namespace: Option<&str>, name: &str) -> Command {
+    let Some(namespace) = namespace else { return Command::new(name) };
+    let mut command = Command::new("ip");
+    command.args(["netns", "exec", namespace, name]);
+    command
 }
 
 impl Broker {
     /// Starts it and waits until it listens.
     pub fn start() -> Self {
-        let folder = TempDir::new().unwrap();
         let port = free_port();
-        let settings = format!(
-            "listener {port} 127.0.0.1\nallow_anonymous true\nuser root\npersistence false\nlog_type error\n"
-        );
-        fs::write(folder.path().join("mosquitto.conf"), settings).unwrap();
-        let process = Self::spawn(&folder, port);
-        Self { port, folder, process }
+        let broker = Self::spawn_new(port, None, &format!("listener {port} 127.0.0.1\n"));
+        broker.wait_until_it_listens();
+        broker
     }
 
-    fn spawn(folder: &TempDir, port: u16) -> Process {
+    /// Starts it in a network namespace, where it listens on this address and on 127.0.0.1. A [`Subscriber`] finds it there.
+    pub fn start_in(namespace: &'static str, address: &str) -> Self {
+        let port = 1883;
+        let listeners = format!("listener {port} 127.0.0.1\nlistener {port} {address}\n");
+        let broker = Self::spawn_new(port, Some(namespace), &listeners);
+        wait_until("mosquitto to listen", || broker.try_publish("probe", "0"));
+        broker
+    }
+
+    fn spawn_new(port: u16, namespace: Option<&'static str>, listeners: &str) -> Self {
+        let folder = TempDir::new().unwrap();
+        let settings =
+            format!("{listeners}allow_anonymous true\nuser root\npersistence false\nlog_type error\n");
+        fs::write(folder.path().join("mosquitto.conf"), settings).unwrap();
+        let process = Self::spawn(&folder, namespace);
+        Self { port, namespace, folder, process }
+    }
+
+    fn spawn(folder: &TempDir, namespace: Option<&str>) -> Process {
         let file = folder.path().join("mosquitto.conf");
-        let process = Process::start("mosquitto", Command::new("mosquitto").arg("-c").arg(file));
-        wait_until("mosquitto to listen", || TcpStream::connect(("127.0.0.1", port)).is_ok());
-        process
+        Process::start("mosquitto", program(namespace, "mosquitto").arg("-c").arg(file))
+    }
+
+    fn wait_until_it_listens(&self) {
+        wait_until("mosquitto to listen", || TcpStream::connect(("127.0.0.1", self.port)).is_ok());
     }
 
     /// Kills it with signal 9: it can say goodbye to nobody and save nothing.
@@ -46,15 +72,19 @@ impl Broker {
 
     /// Starts it again after [`kill`](Self::kill), empty.
     pub fn restart(&mut self) {
-        self.process = Self::spawn(&self.folder, self.port);
+        self.process = Self::spawn(&self.folder, self.namespace);
+        self.wait_until_it_listens();
     }
 
     /// Publishes with mosquitto_pub.
     pub fn publish(&self, topic: &str, payload: &str) {
+        assert!(self.try_publish(topic, payload), "mosquitto_pub {topic}");
+    }
+
+    fn try_publish(&self, topic: &str, payload: &str) -> bool {
         let port = self.port.to_string();
-        let (good, _, stderr) =
-            run("mosquitto_pub", &["-h", "127.0.0.1", "-p", &port, "-t", topic, "-m", payload, "-q", "1"]);
-        assert!(good, "mosquitto_pub: {stderr}");
+        let arguments = ["-h", "127.0.0.1", "-p", &port, "-t", topic, "-m", payload, "-q", "1"];
+        program(self.namespace, "mosquitto_pub").args(arguments).output().unwrap().status.success()
     }
 }
 
@@ -81,7 +111,7 @@ impl Subscriber {
     /// Subscribes to everything. `prefix`, for example `cangate/hall-1/`, is cut off topics that have it.
     pub fn start(broker: &Broker, prefix: &str) -> Self {
         let port = broker.port.to_string();
-        let mut command = Command::new("mosquitto_sub");
+        let mut command = program(broker.namespace, "mosquitto_sub");
         command.args(["-h", "127.0.0.1", "-p", &port, "-q", "0", "-t", "#", "-F", "%r %t %p"]);
         let subscriber =
             Self { process: Process::start("mosquitto_sub", &mut command), prefix: prefix.to_owned() };
@@ -93,7 +123,7 @@ impl Subscriber {
     pub fn wait_until_subscribed(&self, broker: &Broker) {
         let before = self.count();
         wait_until("mosquitto_sub to be subscribed", || {
-            broker.publish("probe", "0");
+            broker.try_publish("probe", "0");
             self.since(before).iter().any(|message| message.topic == "probe")
         });
     }

@@ -57,8 +57,10 @@ pub struct Capture {
 impl Capture {
     /// Starts candump and waits until it listens.
     pub fn start() -> Self {
-        // -L: log format; -D: stay when the interface goes down; -e is left out: error frames are no frames of a participant.
-        let candump = Process::start("candump", Command::new("candump").args(["-L", "-D", BUS]));
+        // -L: log format; -D: stay when the interface goes down; -r: room for what comes while a machine that is busy
+        // elsewhere does not let it read; -e is left out: error frames are no frames of a participant.
+        let candump =
+            Process::start("candump", Command::new("candump").args(["-L", "-D", "-r", "8000000", BUS]));
         // Sent until it is seen.
         let capture = Self { candump };
         wait_until("candump to listen", || {

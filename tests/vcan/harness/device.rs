@@ -68,6 +68,8 @@ impl Device {
 
     /// Power cycle: boot-up message, toggle 0, pre-operational.
     pub fn restart(&self) {
+        // No request in between: its answer would take the first toggle bit.
+        let _turn = self.behaviour.turn.lock().unwrap();
         self.behaviour.toggle.store(false, SeqCst);
         self.behaviour.state.store(127, SeqCst);
         self.send(0x700 + u16::from(self.behaviour.node), &[0]);
@@ -99,6 +101,12 @@ impl Device {
         self.behaviour.toggle.store(toggle, SeqCst);
         self.behaviour.toggles.store(true, SeqCst);
         self.behaviour.answers.store(true, SeqCst);
+    }
+
+    /// Answers the next request with the toggle bit of the last reply, alternating after it.
+    pub fn repeat_once(&self) {
+        let _turn = self.behaviour.turn.lock().unwrap();
+        self.behaviour.toggle.fetch_not(SeqCst);
     }
 
     /// Whether NMT commands have an effect.

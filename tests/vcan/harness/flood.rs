@@ -20,13 +20,16 @@ pub struct Sent {
 /// How often a burst is sent; the smallest that a machine with a 100 Hz clock keeps.
 const BURST_PERIOD: Duration = Duration::from_millis(10);
 
-/// Sends `rate` frames a second for `time`, the identifiers in turn, each frame with other data. A sender that was kept
-/// from running catches up, so that the number of frames is exact.
+/// What is made up for after a delay; more would be a burst such as no bus can carry.
+const CAUGHT_UP: Duration = Duration::from_millis(200);
+
+/// Sends `rate` frames a second for `time`, the identifiers in turn, each frame with other data. The number of frames is
+/// exact; a sender that was kept from running for long takes longer.
 pub fn flood(ids: &[(u16, usize)], rate: u32, time: Duration) -> Sent {
     let socket = CanSocket::open(BUS).unwrap();
     let each = rate * u32::try_from(time.as_secs()).unwrap() / u32::try_from(ids.len()).unwrap();
     let begin = Instant::now();
-    let mut frames = 0;
+    let (mut frames, mut behind) = (0, Duration::ZERO);
     for round in 0..each {
         for (id, length) in ids {
             let data = u64::from(round).to_le_bytes();
@@ -34,10 +37,10 @@ pub fn flood(ids: &[(u16, usize)], rate: u32, time: Duration) -> Sent {
             socket.write_frame_insist(&frame).unwrap();
             frames += 1;
         }
-        let due = BURST_PERIOD * (frames * 100 / rate);
-        if let Some(rest) = due.checked_sub(begin.elapsed()) {
-            std::thread::sleep(rest);
-        }
+        let due = BURST_PERIOD * (frames * 100 / rate) + behind;
+        let now = begin.elapsed();
+        behind += now.saturating_sub(due + CAUGHT_UP);
+        std::thread::sleep(due.saturating_sub(now));
     }
     Sent { each, frames, time: begin.elapsed() }
 }

@@ -20,8 +20,9 @@ pub const TOPICS: &str = "cangate/hall-1/";
 /// What the configuration file says; [`start`](Self::start) writes it.
 pub struct Setup {
     role: &'static str,
-    mqtt: Option<u16>,
+    mqtt: Option<String>,
     nodes: Vec<(String, u8)>,
+    bus_keys: String,
     node_keys: String,
     mqtt_keys: String,
     mappings: Vec<(String, String)>,
@@ -41,6 +42,7 @@ impl Setup {
             role: "master",
             mqtt: None,
             nodes,
+            bus_keys: String::new(),
             node_keys: String::new(),
             mqtt_keys: String::new(),
             mappings: Vec::new(),
@@ -54,14 +56,25 @@ impl Setup {
     }
 
     /// With something on this port that behaves like a broker.
-    pub fn broker_port(mut self, port: u16) -> Self {
-        self.mqtt = Some(port);
+    pub fn broker_port(self, port: u16) -> Self {
+        self.broker_at(&format!("127.0.0.1:{port}"))
+    }
+
+    /// With a broker at this address, `HOST:PORT`.
+    pub fn broker_at(mut self, address: &str) -> Self {
+        self.mqtt = Some(address.to_owned());
         self
     }
 
     /// Sends nothing.
     pub fn passive(mut self) -> Self {
         self.role = "passive";
+        self
+    }
+
+    /// A line for the bus.
+    pub fn bus_key(mut self, line: &str) -> Self {
+        writeln!(self.bus_keys, "{line}").unwrap();
         self
     }
 
@@ -99,6 +112,7 @@ impl Setup {
             "version = 1\n[gateway]\nname = \"{NAME}\"\n[bus.can0]\ninterface = \"{BUS}\"\nrole = \"{}\"\n",
             self.role
         );
+        text.push_str(&self.bus_keys);
         for (name, id) in &self.nodes {
             write!(text, "[node.{name}]\nbus = \"can0\"\nid = {id}\nmapping = \"motortech-detcon\"\n")
                 .unwrap();
@@ -106,8 +120,8 @@ impl Setup {
         }
         write!(text, "[modbus]\nlisten = [\"127.0.0.1:{modbus}\"]\n[http]\nlisten = \"127.0.0.1:{http}\"\n")
             .unwrap();
-        if let Some(port) = self.mqtt {
-            write!(text, "[mqtt]\nurl = \"mqtt://127.0.0.1:{port}\"\n").unwrap();
+        if let Some(address) = &self.mqtt {
+            write!(text, "[mqtt]\nurl = \"mqtt://{address}\"\n").unwrap();
         }
         text + &self.mqtt_keys + &self.more
     }

@@ -44,31 +44,27 @@ impl Table {
 
 /// Reads with mbpoll.
 pub fn mbpoll(port: u16, unit: u8, table: Table, address: u16, count: u16) -> Result<Vec<u16>, String> {
-    let number = |value: u16| value.to_string();
-    let (unit, address, count, port) = (number(unit.into()), number(address), number(count), number(port));
-    let (good, stdout, stderr) = run(
-        "mbpoll",
-        &[
-            "-m",
-            "tcp",
-            "-1",
-            "-q",
-            "-o",
-            "5",
-            "-0",
-            "-a",
-            &unit,
-            "-t",
-            table.mbpoll(),
-            "-r",
-            &address,
-            "-c",
-            &count,
-            "-p",
-            &port,
-            "127.0.0.1",
-        ],
-    );
+    let port = port.to_string();
+    mbpoll_by(&["-m", "tcp", "-p", &port], "127.0.0.1", unit, table, address, count)
+}
+
+/// Reads with mbpoll on a serial line with the settings that every device offers.
+pub fn mbpoll_rtu(line: &str, unit: u8, table: Table, address: u16, count: u16) -> Result<Vec<u16>, String> {
+    mbpoll_by(&["-m", "rtu", "-b", "19200", "-P", "even"], line, unit, table, address, count)
+}
+
+fn mbpoll_by(
+    way: &[&str],
+    to: &str,
+    unit: u8,
+    table: Table,
+    address: u16,
+    count: u16,
+) -> Result<Vec<u16>, String> {
+    let (unit, address, count) = (unit.to_string(), address.to_string(), count.to_string());
+    let what =
+        ["-1", "-q", "-o", "5", "-0", "-a", &unit, "-t", table.mbpoll(), "-r", &address, "-c", &count, to];
+    let (good, stdout, stderr) = run("mbpoll", &[way, &what].concat());
     if !good {
         return Err(format!("{stdout}{stderr}"));
     }

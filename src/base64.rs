@@ -1,9 +1,11 @@
-//! Bytes as base64 text (RFC 2045, in one line): how CiA 309-3 writes octet strings, Unicode strings and domains.
+//! Bytes as base64 text (RFC 4648, in one line): how CiA 309-3 writes octet strings, Unicode strings and domains, and MQTT
+//! what is no text.
 
 const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
 
 /// The text, padded with `=`.
-pub(super) fn encode(bytes: &[u8]) -> String {
+#[must_use]
+pub fn encode(bytes: &[u8]) -> String {
     let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
     for group in bytes.chunks(3) {
         let [a, b, c] = [0, 1, 2].map(|place| u32::from(group.get(place).copied().unwrap_or_default()));
@@ -18,7 +20,8 @@ pub(super) fn encode(bytes: &[u8]) -> String {
 }
 
 /// The bytes; `None` where it is no base64. The padding may be left out.
-pub(super) fn decode(text: &str) -> Option<Vec<u8>> {
+#[must_use]
+pub fn decode(text: &str) -> Option<Vec<u8>> {
     let digits = text.trim_end_matches('=');
     let padding = text.len() - digits.len();
     if padding > 2 || padding > 0 && !text.len().is_multiple_of(4) || digits.len() % 4 == 1 {

@@ -1,8 +1,10 @@
-//! The places for connections of a server, pure: who must go when all are taken.
+//! The places themselves, pure: who must go when all are taken.
 //!
 //! The newcomer always gets in. Who has never asked for anything goes first; then the connection that has been silent for
 //! longest; in both cases one of the address that holds most. So a flood from one address displaces itself and not the
 //! PLC that polls from another, and connections that are opened and left alone do not displace one that works.
+//!
+//! Clients with a reserved place always get in, and go only for one another: where they hold all places, others stay outside.
 
 use core::net::IpAddr;
 use std::cmp::Reverse;
@@ -36,6 +38,8 @@ pub struct SlotId(u64);
 #[derive(Debug)]
 pub struct Slots<H> {
     limit: usize,
+    /// Places that one address may have.
+    share: usize,
     next: u64,
     taken: BTreeMap<SlotId, Slot<H>>,
 }
@@ -43,6 +47,7 @@ pub struct Slots<H> {
 #[derive(Debug)]
 struct Slot<H> {
     address: IpAddr,
+    reserved: bool,
     activity: Arc<Activity>,
     handle: H,
 }
@@ -62,7 +67,13 @@ impl<H> Slots<H> {
     /// `limit` places, at least one.
     #[must_use]
     pub fn new(limit: usize) -> Self {
-        Self { limit: limit.max(1), next: 0, taken: BTreeMap::new() }
+        Self::with_share(limit, usize::MAX)
+    }
+
+    /// The same, of which one address has at most `share`, at least one: beyond it a newcomer displaces one of its own address.
+    #[must_use]
+    pub fn with_share(limit: usize, share: usize) -> Self {
+        Self { limit: limit.max(1), share: share.max(1), next: 0, taken: BTreeMap::new() }
     }
 
     /// Places in use.
@@ -71,27 +82,55 @@ impl<H> Slots<H> {
         self.taken.len()
     }
 
-    /// A place for a newcomer.
+    /// A place for a newcomer that always gets one.
     pub fn take(&mut self, address: IpAddr, handle: H) -> Taken<H> {
-        let evicted = if self.taken.len() >= self.limit { self.evict() } else { None };
+        let own = self.evict_of_share(address);
+        let evicted = if own.is_none() && self.taken.len() >= self.limit { self.evict() } else { own };
+        self.seat(address, true, handle, evicted)
+    }
+
+    /// A place for any other newcomer; `None` where those that always get one hold all of them.
+    pub fn take_unreserved(&mut self, address: IpAddr, handle: H) -> Option<Taken<H>> {
+        let own = self.evict_of_share(address);
+        let evicted = if own.is_none() && self.taken.len() >= self.limit {
+            Some(self.evict_where(|slot| !slot.reserved)?)
+        } else {
+            own
+        };
+        Some(self.seat(address, false, handle, evicted))
+    }
+
+    fn seat(&mut self, address: IpAddr, reserved: bool, handle: H, evicted: Option<H>) -> Taken<H> {
         let id = SlotId(self.next);
         self.next += 1;
         let activity = Arc::new(Activity(AtomicU64::new(0)));
-        self.taken.insert(id, Slot { address, activity: Arc::clone(&activity), handle });
+        self.taken.insert(id, Slot { address, reserved, activity: Arc::clone(&activity), handle });
         Taken { id, activity, evicted }
     }
 
-    /// Takes the place of the one that must go; `None` where nobody has a place.
+    /// Where an address has its share: the one of its own that must go.
+    fn evict_of_share(&mut self, address: IpAddr) -> Option<H> {
+        let held = self.taken.values().filter(|slot| slot.address == address).count();
+        if held < self.share { None } else { self.evict_where(|slot| slot.address == address) }
+    }
+
+    /// Takes the place of the one that must go, of those without a reserved place if there are any; `None` where nobody has a
+    /// place.
     pub fn evict(&mut self) -> Option<H> {
+        self.evict_where(|_| true)
+    }
+
+    fn evict_where(&mut self, may_go: impl Fn(&Slot<H>) -> bool) -> Option<H> {
         let mut held: BTreeMap<IpAddr, usize> = BTreeMap::new();
         for slot in self.taken.values() {
             *held.entry(slot.address).or_default() += 1;
         }
         let order = |(id, slot): &(&SlotId, &Slot<H>)| {
             let last = slot.activity.last();
-            (last > 0, Reverse(held.get(&slot.address).copied()), last, **id)
+            (slot.reserved, last > 0, Reverse(held.get(&slot.address).copied()), last, **id)
         };
-        let victim = self.taken.iter().min_by_key(order).map(|(id, _)| *id)?;
+        let candidates = self.taken.iter().filter(|(_, slot)| may_go(slot));
+        let victim = candidates.min_by_key(order).map(|(id, _)| *id)?;
         self.taken.remove(&victim).map(|slot| slot.handle)
     }
 
@@ -180,5 +219,38 @@ mod tests {
             slots.release(*id);
         }
         assert_eq!((slots.in_use(), slots.evict()), (0, None));
+    }
+
+    #[test]
+    fn f42_a_reserved_place_is_found_at_once_and_never_lost_to_a_stranger() {
+        let mut slots = Slots::new(3);
+        for (stranger, time) in [(1, 30), (2, 10), (3, 20)] {
+            let taken = slots.take_unreserved(address(stranger), "stranger").unwrap();
+            taken.activity.touch(at(time));
+        }
+        let plc = slots.take(address(9), "plc");
+        assert_eq!(plc.evicted, Some("stranger"));
+        // It has not asked for anything yet, and strangers that ask all the time come and go.
+        for time in 0..100 {
+            let taken = slots.take_unreserved(address(4), "stranger").unwrap();
+            assert_eq!(taken.evicted, Some("stranger"));
+            taken.activity.touch(at(1_000 + time));
+        }
+        for name in ["plc 2", "plc 3"] {
+            assert_eq!(slots.take(address(9), name).evicted, Some("stranger"));
+        }
+        assert!(slots.take_unreserved(address(5), "stranger").is_none(), "all are reserved and taken");
+        assert_eq!((slots.in_use(), slots.take(address(8), "plc 4").evicted), (3, Some("plc")));
+    }
+
+    #[test]
+    fn an_address_that_has_its_share_displaces_itself_though_there_is_room() {
+        let mut slots = Slots::with_share(10, 2);
+        for name in ["first", "second"] {
+            assert_eq!(slots.take_unreserved(address(1), name).unwrap().evicted, None);
+        }
+        assert_eq!(slots.take_unreserved(address(1), "third").unwrap().evicted, Some("first"));
+        assert_eq!(slots.take_unreserved(address(2), "other").unwrap().evicted, None);
+        assert_eq!((slots.take(address(1), "fourth").evicted, slots.in_use()), (Some("second"), 3));
     }
 }
