@@ -44,7 +44,7 @@ pub struct Network {
     link_up: bool,
     /// The gateway stops: nothing is sent any more.
     stopped: bool,
-    /// As far as time has come.
+    /// As far as time has come: the latest that was told of. Bytes for lines leave then, whatever came in that waited.
     now: Instant,
     /// Module and channel of the data frames that were given out since the last input, one of each channel at most: the
     /// queue to the bus may have no room for them.
@@ -181,7 +181,7 @@ impl Network {
         let at = now.instant;
         if let Slot::Line(place, channel) = self.slot(frame.id()) {
             if let Some(module) = self.modules.get_mut(place).filter(|_| !frame.is_remote()) {
-                module.handle_data_not_sent(at, channel, frame, &mut self.outputs.of(place));
+                module.handle_data_not_sent(self.now, channel, frame, &mut self.outputs.of(place));
             }
             return;
         }
@@ -253,6 +253,13 @@ impl Network {
             Full::Jobs => SendRefused::Full,
             Full::Bytes => SendRefused::TooLong,
         })
+    }
+
+    /// What the clock shows, where that may be later than what is told of next. A gateway that was kept from running gets the
+    /// frames of a while at once, with the times at which they came: bytes for lines paced by these would leave in one burst
+    /// that no module can hold (R-ESD-037).
+    pub fn handle_clock(&mut self, now: Now) {
+        self.now = self.now.max(now.instant);
     }
 
     /// What became due.

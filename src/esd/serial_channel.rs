@@ -5,6 +5,9 @@
 //! the channel keeps account of what the ring can still hold, as if the line were a little slower than it is, and never lets
 //! it come near its end. Within that, a frame that is sent late is made up for, so that a gateway whose timers are late
 //! sends as fast as the line goes. What holds the line up unseen, which is CTS, is not in the account.
+//!
+//! Three quarters of the ring are left for what the account cannot see: frames that wait together in the queue to the bus (16
+//! at most) and in the interface (six or so), 176 bytes, and then leave in one burst.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -41,9 +44,10 @@ const LONGEST_HOLD: Duration = Duration::from_secs(60);
 /// The newest frames, which may still be given back as not sent: more than the queue to the bus holds of one line.
 const REMEMBERED: usize = 96;
 
-/// A frame that found no room in the queue to the bus is tried again after this time, and for how long.
+/// A frame that found no room in the queue to the bus is tried again after this time, and how often: for a second, in which the
+/// gateway does run. The same second on the clock could be one in which nothing did, and nothing was given up by the bus.
 const REFUSED_AGAIN: Duration = Duration::from_millis(20);
-const LONGEST_REFUSED: Duration = Duration::from_secs(1);
+const MOST_REFUSALS: u32 = 50;
 
 /// One serial line.
 #[derive(Debug)]
@@ -70,8 +74,8 @@ pub(super) struct SerialChannel {
     sent: VecDeque<Sent>,
     /// The next frame was given out, and it is not known yet whether there was room for it.
     in_hand: bool,
-    /// There was none: since when, and when it is tried again.
-    refused: Option<(Instant, Instant)>,
+    /// There was none: how often, and when it is tried again.
+    refused: Option<(u32, Instant)>,
 }
 
 /// Bytes that are to go out together.
@@ -236,10 +240,9 @@ impl SerialChannel {
     pub(super) fn handle_not_sent(&mut self, now: Instant, frame: &CanFrame) -> Returned {
         if self.in_hand && self.next_frame() == Some(*frame) {
             self.in_hand = false;
-            let (since, _) = self.refused.unwrap_or((now, now));
-            self.refused = Some((since, now + REFUSED_AGAIN));
-            let is_long = now.since(since) >= LONGEST_REFUSED;
-            let ended = if is_long { self.break_off(Cause::NoRoom) } else { Vec::new() };
+            let before = self.refused.map_or(0, |(times, _)| times);
+            self.refused = Some((before + 1, now + REFUSED_AGAIN));
+            let ended = if before < MOST_REFUSALS { Vec::new() } else { self.break_off(Cause::NoRoom) };
             return Returned { ended, ..Returned::default() };
         }
         let Some(place) = self.sent.iter().position(|sent| sent.frame == *frame) else {

@@ -206,6 +206,14 @@ impl Gateway {
         self.settle(now);
     }
 
+    /// What the clock shows. Events that waited are told of with the times at which they happened; what leaves meanwhile leaves
+    /// now. To be told before events that may have waited.
+    pub fn handle_clock(&mut self, now: Now) {
+        for bus in &mut self.buses {
+            bus.modules.handle_clock(now);
+        }
+    }
+
     /// What became due.
     pub fn handle_timeout(&mut self, now: Now) {
         for bus in (0..self.buses.len()).map(BusIndex) {

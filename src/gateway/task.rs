@@ -21,7 +21,8 @@ use crate::time::{Clock, Instant, Now};
 /// Events of buses that are taken in before the image is published once.
 const BATCH: usize = 128;
 
-/// Places of a bus's queue that bytes for serial lines leave free, so that a slow bus delays them and not guard requests.
+/// Places of a bus's queue that bytes for serial lines leave free, so that a slow bus delays them and not guard requests. The 16
+/// others hold less than a module can take at once, should they have waited and leave together (R-ESD-037).
 const KEPT_FREE: usize = 48;
 
 /// How long the last frames may wait for a place in the queue of their bus.
@@ -142,6 +143,7 @@ impl Driver {
 
     /// The receive time of the newest event.
     fn take_events(&mut self, batch: &mut Vec<(BusIndex, BusEvent)>) -> Option<Now> {
+        self.gateway.handle_clock(self.clock.now());
         let mut newest: Option<Now> = None;
         for (bus, event) in batch.drain(..) {
             let at = match &event {
@@ -404,8 +406,8 @@ mod tests {
         assert!(ends.reader.read(|image| image.written_at) <= written_at + SIGN_OF_LIFE);
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn bytes_for_a_serial_line_leave_room_for_what_cannot_wait() {
+    /// An engine, and a module to whose line 4,096 bytes are being sent.
+    async fn start_with_bytes_for_a_line(transmit_bound: usize) -> (Ends, oneshot::Receiver<Outcome>) {
         let sketch = crate::mapping::Sketch::new()
             .bus(|bus| bus.bit_rate = Some(crate::mapping::At::nowhere(1_000_000)));
         let sketch = sketch.node("engine", 1, "motortech-detcon", |_| ());
@@ -415,13 +417,41 @@ mod tests {
                 crate::mapping::installation::ChannelEntry::default(),
             );
         });
-        let mut ends = start_with(sketch.build().unwrap().0, 64);
+        let mut ends = start_with(sketch.build().unwrap().0, transmit_bound);
         ends.until(|image| image.lines[0].open).await;
         let line = crate::process_image::LineIndex(0);
         let action = Action::SerialSend { line, bytes: vec![b'x'; 4_096] };
-        let (reply, mut answer) = oneshot::channel();
+        let (reply, answer) = oneshot::channel();
         let command = Command { id: 1, source: CommandSource::serial("test".into()), action };
         ends.commands.send((command, reply)).await.unwrap();
+        (ends, answer)
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn r_esd_037_a_gateway_that_is_late_does_not_overrun_a_line() {
+        let (mut ends, _answer) = start_with_bytes_for_a_line(1_024).await;
+        let taken = |ends: &mut Ends| -> usize {
+            let frames = std::iter::from_fn(|| ends.frames.try_recv().ok());
+            frames.filter(|frame| frame.to_string().starts_with("105#")).map(|frame| frame.data().len()).sum()
+        };
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        assert!(taken(&mut ends) > 500);
+        // The process stands still while the line says something every millisecond.
+        let from = ends.clock.now();
+        tokio::time::advance(Duration::from_millis(500)).await;
+        for late in 0..500 {
+            let at = from.later(Duration::from_millis(late));
+            let event = BusEvent::Frame { frame: "104#41".parse().unwrap(), at };
+            ends.events.try_send((BusIndex(0), event)).unwrap();
+        }
+        tokio::time::sleep(2 * CATCH_UP).await;
+        let burst = taken(&mut ends);
+        assert!((8..=64).contains(&burst), "{burst} bytes at once, of which a module keeps 256");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn bytes_for_a_serial_line_leave_room_for_what_cannot_wait() {
+        let (mut ends, mut answer) = start_with_bytes_for_a_line(64).await;
         // Nobody takes frames from the queue: bytes for the line fill a quarter of it, the rest is left to guard requests.
         tokio::time::sleep(Duration::from_millis(800)).await;
         let (mut data, mut guards) = (0, 0);

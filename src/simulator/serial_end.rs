@@ -26,8 +26,8 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::serial_place::{PlaceKind, SerialPlace};
 
-/// Pieces of output that wait for somebody who does not read.
-pub const CHUNKS: usize = 1024;
+/// Pieces of output, most of them of one byte, that wait for somebody who does not read: some seconds of a fast line.
+pub const CHUNKS: usize = 16 * 1024;
 /// Most bytes that are read at once.
 const PIECE: usize = 256;
 /// How often a pseudo-terminal is looked at that nobody has open.
@@ -271,8 +271,11 @@ async fn read(
 }
 
 async fn write(mut to: impl AsyncWrite + Unpin, output: &mut mpsc::Receiver<Vec<u8>>) {
-    while let Some(piece) = output.recv().await {
-        if to.write_all(&piece).await.is_err() || to.flush().await.is_err() {
+    // Pieces may be of one byte, and more of them wait where this task did not get the processor for a while.
+    let mut pieces = Vec::new();
+    while output.recv_many(&mut pieces, CHUNKS).await > 0 {
+        let bytes: Vec<u8> = pieces.drain(..).flatten().collect();
+        if to.write_all(&bytes).await.is_err() || to.flush().await.is_err() {
             return;
         }
     }

@@ -26,7 +26,7 @@ use crate::harness::wait::{give_it, wait_for, wait_until};
 const MODULE: u8 = 0x1A;
 const CHANNELS: u8 = 5;
 /// Bytes each way on each line, unless the environment says otherwise.
-const BYTES: usize = 8_192;
+const BYTES: usize = 24_576;
 
 /// A gateway with a `DetCon` of node 1 and a module whose lines are TCP ports.
 struct Plant {
@@ -103,8 +103,12 @@ impl Plant {
         connect(self.ports[usize::from(channel) - 1])
     }
 
+    /// The module is there for it: what came out of a line before would be lost.
     fn end(&self, channel: u8) -> TcpStream {
-        connect(self.ends[usize::from(channel) - 1].unwrap())
+        let stream = connect(self.ends[usize::from(channel) - 1].unwrap());
+        let said = format!("channel {channel}: {} is connected", stream.local_addr().unwrap());
+        wait_until(&said, || self.module.stdout(0).iter().any(|line| line.text.ends_with(&said)));
+        stream
     }
 
     /// A counter of a channel, two registers at this offset.
