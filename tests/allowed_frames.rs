@@ -323,11 +323,12 @@ pub fn step() -> impl Strategy<Value = Step> {
 }
 
 /// Takes what the gateway has to send; each frame is in the list that was made by itself.
-fn drain(gateway: &mut Gateway, allowed: &AllowedFrames) -> usize {
+fn drain(gateway: &mut Gateway, allowed: &AllowedFrames, now: Now) -> usize {
     let mut sent = 0;
     while let Some(output) = gateway.poll_output() {
         if let Output::Transmit { bus, frame } = output {
             assert!(allowed.permit(bus, &frame).is_some(), "{frame} on {bus:?}");
+            gateway.handle_input(now, Input::Bus { bus, event: BusEvent::Sent { frame, at: now } });
             sent += 1;
         }
     }
@@ -350,7 +351,7 @@ proptest! {
             let event = BusEvent::Link { link: Link::ErrorActive, at: Now::from_millis(0) };
             gateway.handle_input(Now::from_millis(0), Input::Bus { bus, event });
         }
-        let mut sent = drain(&mut gateway, &allowed);
+        let mut sent = drain(&mut gateway, &allowed, Now::from_millis(millis));
         for (id, step) in (0..).zip(steps) {
             let at = Now::from_millis(millis);
             match step {
@@ -377,15 +378,15 @@ proptest! {
                     {
                         millis = (due.as_micros().div_ceil(1_000)).max(millis);
                         gateway.handle_timeout(Now::from_millis(millis));
-                        sent += drain(&mut gateway, &allowed);
+                        sent += drain(&mut gateway, &allowed, Now::from_millis(millis));
                     }
                     millis = end;
                 }
             }
-            sent += drain(&mut gateway, &allowed);
+            sent += drain(&mut gateway, &allowed, Now::from_millis(millis));
         }
         gateway.handle_stop(Now::from_millis(millis));
-        sent += drain(&mut gateway, &allowed);
+        sent += drain(&mut gateway, &allowed, Now::from_millis(millis));
         gateway.publish(&mut image);
         // Told with the next counters of a bus.
         let at = Now::from_millis(millis);

@@ -218,7 +218,15 @@ fn bus(name: &str, clock: Clock, stop: &CancellationToken) -> BusEnd {
     let (events_to, events) = mpsc::channel(1024);
     let (transmit, frames) = mpsc::channel(64);
     let interface = Interface::Virtual(name.to_owned());
-    tokio::spawn(can::task::run(BusIndex(0), interface, false, events_to, frames, clock, stop.clone()));
+    tokio::spawn(can::task::run(
+        BusIndex(0),
+        interface,
+        can::task::Sending::Untold,
+        events_to,
+        frames,
+        clock,
+        stop.clone(),
+    ));
     BusEnd { events, transmit }
 }
 

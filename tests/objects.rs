@@ -274,15 +274,23 @@ struct Tasks {
 
 fn tasks(name: &str) -> Tasks {
     let (clock, stop) = (Clock::start(), CancellationToken::new());
-    let bus = |listen_only| {
+    let bus = || {
         let (events_to, events) = mpsc::channel(1024);
         let (transmit, frames) = mpsc::channel(64);
         let interface = Interface::Virtual(name.to_owned());
-        let run = can::task::run(BusIndex(0), interface, listen_only, events_to, frames, clock, stop.clone());
+        let run = can::task::run(
+            BusIndex(0),
+            interface,
+            can::task::Sending::Untold,
+            events_to,
+            frames,
+            clock,
+            stop.clone(),
+        );
         tokio::spawn(run);
         (events, transmit)
     };
-    let (events, transmit) = bus(false);
+    let (events, transmit) = bus();
     let (lines, report) = (mpsc::channel(1).1, mpsc::channel(1).0);
     let device = simulator::task::run(
         vec![transmitter()],
@@ -293,7 +301,7 @@ fn tasks(name: &str) -> Tasks {
         stop.clone(),
     );
     tokio::spawn(device);
-    let (events, transmit) = bus(false);
+    let (events, transmit) = bus();
     let gateway = Gateway::new(plant(), clock.now());
     let (writer, _) = process_image(gateway.empty_image());
     let (desk, commands) = Desk::new(32);

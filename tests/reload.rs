@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use cangate::can::interface::Interface;
+use cangate::can::task::Sending;
 use cangate::can::{self, BusEvent, BusIndex, CanFrame};
 use cangate::config;
 use cangate::mapping::SourceText;
@@ -140,8 +141,8 @@ async fn engines(bus: &str, clock: Clock, requests: Requests, stop: Cancellation
         }
     };
     tokio::join!(
-        can::task::run(BusIndex(0), interface(), false, to_us, to_send, clock, stop.clone()),
-        can::task::run(BusIndex(0), interface(), true, to_spy, nothing, clock, stop.clone()),
+        can::task::run(BusIndex(0), interface(), Sending::Untold, to_us, to_send, clock, stop.clone()),
+        can::task::run(BusIndex(0), interface(), Sending::Never, to_spy, nothing, clock, stop.clone()),
         devices,
         spy
     );

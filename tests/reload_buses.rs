@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 
 use cangate::can::interface::Interface;
+use cangate::can::task::Sending;
 use cangate::can::{self, BusEvent, BusIndex, CanFrame};
 use cangate::simulator::{self, task::BusEnd};
 use cangate::supervisor::{self, Ended, Reloads, Tasks};
@@ -108,8 +109,8 @@ async fn devices(bus: &str, clock: Clock, heard: Arc<Mutex<Vec<String>>>, stop: 
         }
     };
     tokio::join!(
-        can::task::run(BusIndex(0), interface(), false, to_us, to_send, clock, stop.clone()),
-        can::task::run(BusIndex(0), interface(), true, to_spy, nothing, clock, stop.clone()),
+        can::task::run(BusIndex(0), interface(), Sending::Untold, to_us, to_send, clock, stop.clone()),
+        can::task::run(BusIndex(0), interface(), Sending::Never, to_spy, nothing, clock, stop.clone()),
         devices,
         spy
     );

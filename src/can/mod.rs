@@ -62,6 +62,14 @@ pub enum BusEvent {
         /// When.
         at: Now,
     },
+    /// The interface took a frame that the gateway asked to send. Told of each that is not [`NotSent`](Self::NotSent), where that
+    /// was asked for ([`Sending::Told`](task::Sending)); some interfaces take a frame and give it back later: then both.
+    Sent {
+        /// The frame.
+        frame: CanFrame,
+        /// When it was taken.
+        at: Now,
+    },
     /// A frame that the gateway asked to send did not leave: it is not the node's fault if no answer comes.
     NotSent {
         /// The frame.

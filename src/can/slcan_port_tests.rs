@@ -74,19 +74,15 @@ fn on_duplex_of(bytes: usize, bit_rate: Option<u32>) -> (Played<DuplexStream>, S
 }
 
 async fn next_link(reader: &mut SlcanReader) -> Link {
-    match reader.recv().await.unwrap() {
-        BusEvent::Link { link, .. } => link,
-        BusEvent::Frame { frame, .. } => panic!("{frame}"),
-        BusEvent::NotSent { .. } | BusEvent::Counters { .. } => panic!("no link"),
-    }
+    let event = reader.recv().await.unwrap();
+    let BusEvent::Link { link, .. } = event else { panic!("no link: {event:?}") };
+    link
 }
 
 async fn next_frame(reader: &mut SlcanReader) -> String {
-    match reader.recv().await.unwrap() {
-        BusEvent::Frame { frame, .. } => frame.to_string(),
-        BusEvent::Link { link, .. } => panic!("{link:?}"),
-        BusEvent::NotSent { .. } | BusEvent::Counters { .. } => panic!("no frame"),
-    }
+    let event = reader.recv().await.unwrap();
+    let BusEvent::Frame { frame, .. } = event else { panic!("no frame: {event:?}") };
+    frame.to_string()
 }
 
 fn frame(text: &str) -> CanFrame {

@@ -28,21 +28,32 @@ const STEADY: Duration = Duration::from_secs(10);
 /// How often the counters are reported.
 const REPORT_EVERY: Duration = Duration::from_secs(1);
 
+/// What the task does with frames that are to be sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sending {
+    /// Nothing may leave, not even the acknowledging of frames: `listen_only` as with [`open`]. Where an interface of the host
+    /// acknowledges frames all the same, that is logged.
+    Never,
+    /// They are sent; those that could not be are told of.
+    Untold,
+    /// The same, and each that left is told of ([`BusEvent::Sent`]). The next one waits until there is room to tell it.
+    Told,
+}
+
 /// Runs one bus until `stop`, or until the gateway is gone.
 ///
-/// `listen_only` is as with [`open`]; where an interface of the host acknowledges frames all the same, that is logged.
 /// `events` is awaited when it is full. Frames are taken from `transmit` one after another.
 pub async fn run(
     bus: BusIndex,
     interface: Interface,
-    listen_only: bool,
+    sending: Sending,
     events: mpsc::Sender<(BusIndex, BusEvent)>,
     transmit: mpsc::Receiver<CanFrame>,
     clock: Clock,
     stop: CancellationToken,
 ) {
-    let ends = Ends { bus, name: interface.to_string(), listen_only, events, transmit, clock, stop };
-    run_with(|| open(&interface, listen_only, clock), longest_wait(&interface), ends).await;
+    let ends = Ends { bus, name: interface.to_string(), sending, events, transmit, clock, stop };
+    run_with(|| open(&interface, sending == Sending::Never, clock), longest_wait(&interface), ends).await;
 }
 
 /// An interface that was re-created is found within a second; a far host is not called that often.
@@ -61,8 +72,8 @@ pub struct Ends {
     pub bus: BusIndex,
     /// The interface as the user wrote it, for the log.
     pub name: String,
-    /// Nothing may leave, not even the acknowledging of frames.
-    pub listen_only: bool,
+    /// Of frames that are to be sent.
+    pub sending: Sending,
     /// To the gateway.
     pub events: mpsc::Sender<(BusIndex, BusEvent)>,
     /// From the gateway.
@@ -79,8 +90,8 @@ pub async fn run_with<R: BusReader, W: BusWriter>(
     longest_wait: Duration,
     ends: Ends,
 ) {
-    let Ends { bus, name, listen_only, events, transmit, clock, stop } = ends;
-    let desk = Desk { bus, name, listen_only, events, clock, state: Mutex::default() };
+    let Ends { bus, name, sending, events, transmit, clock, stop } = ends;
+    let desk = Desk { bus, name, sending, events, clock, state: Mutex::default() };
     let writer = tokio::sync::Mutex::new(None);
     tokio::select! {
         // First what is to be sent: a gateway that has gone may have left something.
@@ -98,7 +109,7 @@ struct GatewayGone;
 struct Desk {
     bus: BusIndex,
     name: String,
-    listen_only: bool,
+    sending: Sending,
     events: mpsc::Sender<(BusIndex, BusEvent)>,
     clock: Clock,
     state: Mutex<State>,
@@ -273,7 +284,7 @@ impl Session<'_> {
                 }
             };
             let tally = reader.tally();
-            if self.desk.listen_only {
+            if self.desk.sending == Sending::Never {
                 self.log.handle_listening(tally.listens_only);
             }
             let lost_frames = self.desk.take_tally(tally);
@@ -304,8 +315,8 @@ impl Session<'_> {
                 self.log.handle_counters(&self.desk.state().counters);
             }
             BusEvent::NotSent { frame, .. } => self.desk.count_came_back(&frame),
-            // Counters are this task's own business.
-            BusEvent::Counters { .. } => return Ok(()),
+            // These are this task's own business.
+            BusEvent::Sent { .. } | BusEvent::Counters { .. } => return Ok(()),
         }
         self.desk.tell(event).await
     }
@@ -324,20 +335,21 @@ async fn write_for_ever<W: BusWriter>(
             Some(writer) if desk.is_up() => Some(writer.send(&frame).await),
             Some(_) | None => None,
         };
-        match sent {
-            Some(Ok(())) => {
-                desk.count_sent(&frame);
-                continue;
+        let at = desk.clock.now();
+        if let Some(Ok(())) = sent {
+            desk.count_sent(&frame);
+            if desk.sending == Sending::Told {
+                desk.tell(BusEvent::Sent { frame, at }).await?;
             }
-            Some(Err(error)) => {
-                if let Some(unsaid) = failures.admit(desk.clock.now().instant) {
-                    tracing::warn!(interface = desk.name, %frame, %error, unsaid, "a frame was not sent");
-                }
-            }
-            None => {}
+            continue;
+        }
+        if let Some(Err(error)) = sent
+            && let Some(unsaid) = failures.admit(at.instant)
+        {
+            tracing::warn!(interface = desk.name, %frame, %error, unsaid, "a frame was not sent");
         }
         desk.count_not_sent();
-        desk.tell(BusEvent::NotSent { frame, at: desk.clock.now() }).await?;
+        desk.tell(BusEvent::NotSent { frame, at }).await?;
     }
     Ok(())
 }

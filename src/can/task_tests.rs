@@ -82,7 +82,7 @@ fn run_on(openings: Vec<Result<(FakeReader, FakeWriter), BusError>>) -> Harness 
     let ends = Ends {
         bus: BusIndex(3),
         name: "fake".into(),
-        listen_only: false,
+        sending: Sending::Told,
         events,
         transmit: to_send,
         clock,
@@ -93,24 +93,21 @@ fn run_on(openings: Vec<Result<(FakeReader, FakeWriter), BusError>>) -> Harness 
 }
 
 impl Harness {
-    /// The next event that is not the report of the counters.
+    /// The next event that is not the report of the counters, nor of a frame that was sent.
     async fn next(&mut self) -> BusEvent {
         loop {
             let (bus, event) = self.events.recv().await.unwrap();
             assert_eq!(bus, BusIndex(3));
-            if !matches!(event, BusEvent::Counters { .. }) {
+            if !matches!(event, BusEvent::Counters { .. } | BusEvent::Sent { .. }) {
                 return event;
             }
         }
     }
 
     async fn next_link(&mut self) -> Link {
-        match self.next().await {
-            BusEvent::Link { link, .. } => link,
-            BusEvent::Frame { .. } | BusEvent::NotSent { .. } | BusEvent::Counters { .. } => {
-                panic!("no link")
-            }
-        }
+        let event = self.next().await;
+        let BusEvent::Link { link, .. } = event else { panic!("no link: {event:?}") };
+        link
     }
 
     /// The counters that are reported from now on.
@@ -195,6 +192,29 @@ async fn p20_a_frame_for_a_bus_that_is_not_up_is_given_back_at_once_and_never_se
     assert_eq!(stage.sent.recv().await, Some(frame("000#0101")));
     let counters = harness.counters().await;
     assert_eq!((counters.frames_sent, counters.frames_not_sent, counters.bus_off_count), (1, 2, 1));
+}
+
+#[tokio::test(start_paused = true)]
+async fn of_each_frame_one_thing_is_told_in_order_that_it_was_sent_or_was_not() {
+    let (mut stage, bus) = fake_bus();
+    let mut harness = run_on(vec![Ok(bus)]);
+    stage.script.send(Ok(link(Link::ErrorActive))).await.unwrap();
+    harness.next_link().await;
+    for number in 0..6_u8 {
+        *stage.busy.lock().unwrap() = number % 3 == 2;
+        harness.transmit.send(frame(&format!("105#{number:02X}"))).await.unwrap();
+        let mut told = harness.events.recv().await.unwrap().1;
+        while matches!(told, BusEvent::Counters { .. }) {
+            told = harness.events.recv().await.unwrap().1;
+        }
+        let expected = frame(&format!("105#{number:02X}"));
+        if number % 3 == 2 {
+            assert!(matches!(told, BusEvent::NotSent { frame, .. } if frame == expected), "{told:?}");
+        } else {
+            assert!(matches!(told, BusEvent::Sent { frame, .. } if frame == expected), "{told:?}");
+            assert_eq!(stage.sent.try_recv(), Ok(expected));
+        }
+    }
 }
 
 #[tokio::test(start_paused = true)]
@@ -302,7 +322,7 @@ async fn openings_of_a_bus_that_works_for(each: Duration) -> Vec<u64> {
     let ends = Ends {
         bus: BusIndex(0),
         name: "fake".into(),
-        listen_only: false,
+        sending: Sending::Told,
         events,
         transmit: to_send,
         clock,
@@ -345,7 +365,7 @@ async fn reading_goes_on_while_a_send_hangs() {
     let ends = Ends {
         bus: BusIndex(0),
         name,
-        listen_only: false,
+        sending: Sending::Told,
         events,
         transmit: to_send,
         clock: Clock::start(),
@@ -386,7 +406,8 @@ async fn a_virtual_bus_is_run_by_the_same_task() {
     let stop = CancellationToken::new();
     let ours = bus.clone();
     let name = "virtual:test".to_owned();
-    let ends = Ends { bus: BusIndex(0), name, listen_only: false, events, transmit: to_send, clock, stop };
+    let ends =
+        Ends { bus: BusIndex(0), name, sending: Sending::Told, events, transmit: to_send, clock, stop };
     let _task = tokio::spawn(run_with(move || Ok(ours.join(clock)), LONGEST, ends));
     let (mut reader, mut writer) = bus.join(clock);
     while !matches!(told.recv().await.unwrap().1, BusEvent::Link { link: Link::ErrorActive, .. }) {}

@@ -11,6 +11,7 @@ use super::args::DemoArguments;
 use super::output::{block_on, print_error, print_line, stop_on_signal};
 use super::{Exit, load, run};
 use crate::can::interface::Interface;
+use crate::can::task::Sending;
 use crate::can::{self, BusIndex};
 use crate::mqtt::settings::BrokerUrl;
 use crate::simulator;
@@ -165,7 +166,8 @@ async fn simulate(clock: Clock, stop: CancellationToken) {
     let (transmit, to_send) = mpsc::channel(QUEUE);
     // No orders: the demo tells its story by itself.
     let (_, lines) = mpsc::channel(1);
-    let bus = can::task::run(BusIndex(0), interface, false, events_to_us, to_send, clock, stop.clone());
+    let bus =
+        can::task::run(BusIndex(0), interface, Sending::Untold, events_to_us, to_send, clock, stop.clone());
     let end = BusEnd { events, transmit };
     // No reports either: what the devices do is seen through the gateway.
     let (report, _) = mpsc::channel(1);

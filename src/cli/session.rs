@@ -9,6 +9,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::Exit;
 use crate::can::interface::Interface;
+use crate::can::task::Sending;
 use crate::can::{self, BusEvent, BusIndex, CanFrame, Link};
 use crate::time::{Clock, Instant, Now};
 
@@ -182,7 +183,7 @@ impl Session {
         let run = can::task::run(
             BusIndex(0),
             interface.clone(),
-            listen_only,
+            if listen_only { Sending::Never } else { Sending::Untold },
             events_to_us,
             to_send,
             clock,
@@ -214,7 +215,7 @@ impl Session {
         while !link.is_up() {
             match self.next(deadline).await? {
                 Some(BusEvent::Link { link: now, .. }) => link = now,
-                Some(BusEvent::Frame { .. } | BusEvent::NotSent { .. } | BusEvent::Counters { .. }) => {}
+                Some(_) => {}
                 None => return Err(SessionError::NotUp { interface: self.interface.clone(), link }),
             }
         }
@@ -295,7 +296,7 @@ impl Session {
                 Some(BusEvent::Link { link, .. }) if !link.is_up() => {
                     return Err(SessionError::Lost { interface: self.interface.clone(), link });
                 }
-                Some(BusEvent::Link { .. } | BusEvent::Counters { .. }) => {}
+                Some(BusEvent::Link { .. } | BusEvent::Sent { .. } | BusEvent::Counters { .. }) => {}
                 None => machine.handle_timeout(self.clock.now()),
             }
         }

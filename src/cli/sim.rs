@@ -14,6 +14,7 @@ use super::Exit;
 use super::args::{SimArguments, SimDevice};
 use super::output::{block_on, print_error, stop_on_signal};
 use crate::can::interface::Interface;
+use crate::can::task::Sending;
 use crate::can::{self, BusIndex};
 use crate::simulator::cbm_sio::line::LineKind;
 use crate::simulator::serial_end::SerialEnd;
@@ -285,8 +286,15 @@ pub async fn run(
         // Nobody waits any more when the simulation was given up.
         let _ = printed_to_us.send(());
     });
-    let bus =
-        can::task::run(BusIndex(0), options.interface, false, events_to_us, to_send, clock, stop.clone());
+    let bus = can::task::run(
+        BusIndex(0),
+        options.interface,
+        Sending::Untold,
+        events_to_us,
+        to_send,
+        clock,
+        stop.clone(),
+    );
     let devices = task::run_with_ends(plans, ends, BusEnd { events, transmit }, lines, reports, clock, stop);
     tokio::join!(bus, devices);
     // What is not printed by now is not worth waiting for.

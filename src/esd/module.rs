@@ -199,6 +199,13 @@ impl Module {
         self.procedure.as_mut().is_some_and(|procedure| procedure.handle_not_sent(now, frame))
     }
 
+    /// A data frame to one of its lines left.
+    pub(super) fn handle_data_sent(&mut self, now: Instant, place: usize, frame: &CanFrame) {
+        if let Some(channel) = self.channels.get_mut(place) {
+            channel.handle_sent(now, frame);
+        }
+    }
+
     /// A data frame to one of its lines did not leave.
     pub(super) fn handle_data_not_sent(
         &mut self,
@@ -292,9 +299,9 @@ impl Module {
     }
 
     /// That frame was handed to the bus, if it was not given back.
-    pub(super) fn data_handed_out(&mut self, now: Instant, place: usize, teller: &mut Teller<'_>) {
+    pub(super) fn data_handed_out(&mut self, place: usize, teller: &mut Teller<'_>) {
         let Some(channel) = self.channels.get_mut(place) else { return };
-        let (bytes, ended) = channel.handed_out(now);
+        let (bytes, ended) = channel.handed_out();
         if bytes > 0 {
             teller.tell(ModuleEvent::Sent { channel: place, bytes });
         }

@@ -173,6 +173,20 @@ impl Network {
         self.drive(at);
     }
 
+    /// The interface took a data frame for a line. Of each that [`poll_output`](Self::poll_output) gives, this is to be told, or
+    /// [`handle_not_sent`](Self::handle_not_sent): until then it counts as something that the module will still get, however
+    /// long that takes (R-ESD-037). Of other frames it need not be told.
+    pub fn handle_sent(&mut self, now: Now, frame: &CanFrame) {
+        self.now = self.now.max(now.instant);
+        let Slot::Line(place, channel) = self.slot(frame.id()) else { return };
+        let Some(module) = self.modules.get_mut(place).filter(|_| !frame.is_remote()) else { return };
+        if let Some(given) = self.in_hand.iter().position(|given| *given == (place, channel)) {
+            self.in_hand.swap_remove(given);
+            module.data_handed_out(channel, &mut self.outputs.of(place));
+        }
+        module.handle_data_sent(now.instant, channel, frame);
+    }
+
     /// A frame of ours did not leave: what waits for its answer must not blame the module, and bytes in it were not
     /// sent.
     pub fn handle_not_sent(&mut self, now: Now, frame: &CanFrame) {
@@ -306,7 +320,7 @@ impl Network {
         self.now = self.now.max(now.instant);
         for (place, channel) in std::mem::take(&mut self.in_hand) {
             if let Some(module) = self.modules.get_mut(place) {
-                module.data_handed_out(self.now, channel, &mut self.outputs.of(place));
+                module.data_handed_out(channel, &mut self.outputs.of(place));
             }
         }
         now.instant

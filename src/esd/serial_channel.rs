@@ -6,8 +6,8 @@
 //! it come near its end. Within that, a frame that is sent late is made up for, so that a gateway whose timers are late
 //! sends as fast as the line goes. What holds the line up unseen, which is CTS, is not in the account.
 //!
-//! Three quarters of the ring are left for what the account cannot see: frames that wait together in the queue to the bus (16
-//! at most) and in the interface (six or so), 176 bytes, and then leave in one burst.
+//! A frame enters the account when the bus says that it left: what waits on the way there does not drain, and would leave in
+//! one burst. Three quarters of the ring are left for what nobody tells of, such as frames that wait in the interface.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -64,6 +64,8 @@ pub(super) struct SerialChannel {
     messages: Messages,
     jobs: VecDeque<Job>,
     ring: Bucket,
+    /// Frames that were handed to the bus and have not left, for all that is known. They do not drain.
+    on_way: VecDeque<CanFrame>,
     /// When the next frame may leave at the earliest, where there is a distance to keep.
     next: Instant,
     /// The other end said stop; it holds until then.
@@ -141,6 +143,7 @@ impl SerialChannel {
             messages: Messages::new(&settings.framing),
             jobs: VecDeque::new(),
             ring: Bucket::new(),
+            on_way: VecDeque::new(),
             next: Instant::START,
             stopped_until: None,
             suspended: None,
@@ -187,12 +190,17 @@ impl SerialChannel {
         Ok(())
     }
 
-    /// When the next frame may leave; may lie in the past. `None`: nothing waits, or the other end said stop.
+    /// When the next frame may leave; may lie in the past. `None`: nothing waits, the other end said stop, or what is on its way
+    /// has to leave before.
     pub(super) fn due(&self) -> Option<Instant> {
         let waits = !self.in_hand && self.stopped_until.is_none();
         let job = self.jobs.front().filter(|_| waits)?;
-        let room = self.ring.opens(self.cost(job.next_bytes().len()), self.cost_of(self.ahead()));
-        let due = room.max(self.next);
+        let on_way: usize = self.on_way.iter().map(|frame| frame.data().len()).sum();
+        let (cost, depth) = (self.cost(on_way + job.next_bytes().len()), self.cost_of(self.ahead()));
+        if cost > depth || (self.gap.is_some() && on_way > 0) {
+            return None;
+        }
+        let due = self.ring.opens(cost, depth).max(self.next);
         Some(self.refused.map_or(due, |(_, again)| due.max(again)))
     }
 
@@ -208,8 +216,9 @@ impl SerialChannel {
         CanFrame::data_frame(self.rx_id, bytes).filter(|_| !bytes.is_empty())
     }
 
-    /// The frame was handed to the bus. How many bytes that were, and what that ended.
-    pub(super) fn handed_out(&mut self, now: Instant) -> (usize, Option<Ended>) {
+    /// The frame was handed to the bus. How many bytes that were, and what that ended. [`handle_sent`](Self::handle_sent) or
+    /// [`handle_not_sent`](Self::handle_not_sent) is to follow.
+    pub(super) fn handed_out(&mut self) -> (usize, Option<Ended>) {
         if !std::mem::take(&mut self.in_hand) {
             return (0, None);
         }
@@ -222,13 +231,21 @@ impl SerialChannel {
                 self.sent.pop_front();
             }
             self.sent.push_back(Sent { job: job.id, before: job.done, frame });
+            self.on_way.push_back(frame);
         }
         job.done += count;
         let is_done = job.done >= job.bytes.len();
-        self.ring.fill(now, self.cost(count));
-        self.next = now + self.gap.unwrap_or_default();
         let ended = if is_done { self.jobs.pop_front() } else { None };
         (count, ended.map(|job| Ended { id: job.id, outcome: SendOutcome::Done }))
+    }
+
+    /// A frame on its way left, and with it those before it, as they leave in order: the module has them. One that nobody knows
+    /// of is from before.
+    pub(super) fn handle_sent(&mut self, now: Instant, frame: &CanFrame) {
+        let Some(place) = self.on_way.iter().position(|on_way| on_way == frame) else { return };
+        let bytes = self.on_way.drain(..=place).map(|frame| frame.data().len()).sum();
+        self.ring.fill(now, self.cost(bytes));
+        self.next = now + self.gap.unwrap_or_default();
     }
 
     /// A frame did not leave.
@@ -245,11 +262,15 @@ impl SerialChannel {
             let ended = if before < MOST_REFUSALS { Vec::new() } else { self.break_off(Cause::NoRoom) };
             return Returned { ended, ..Returned::default() };
         }
+        // If it is not on its way any more, it had left and was given back.
+        if let Some(place) = self.on_way.iter().position(|on_way| on_way == frame) {
+            self.on_way.remove(place);
+        }
         let Some(place) = self.sent.iter().position(|sent| sent.frame == *frame) else {
             return Returned::default();
         };
         // What is in hand was not given back until now: it leaves.
-        let (handed, done) = self.handed_out(now);
+        let (handed, done) = self.handed_out();
         let current = self.jobs.front().map(|job| job.id);
         let is_current = |sent: &Sent| Some(sent.job) == current && sent.frame == *frame;
         let mut returned = Returned { handed, missing: 0, ended: Vec::from_iter(done) };

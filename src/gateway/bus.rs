@@ -220,6 +220,18 @@ impl Gateway {
         self.refresh_nodes_of(now, index);
     }
 
+    /// The interface took a frame: lines of modules are paced by that.
+    pub(super) fn bus_sent(&mut self, now: Now, index: BusIndex, frame: &CanFrame) {
+        if !self.can_wait(index, frame) {
+            return;
+        }
+        if let Some(bus) = self.buses.get_mut(index.0) {
+            bus.modules.handle_sent(now, frame);
+        }
+        self.drain_modules(now, index);
+        self.settle(now);
+    }
+
     pub(super) fn bus_not_sent(&mut self, now: Now, index: BusIndex, frame: &CanFrame) {
         let Some(bus) = self.buses.get_mut(index.0) else { return };
         if bus.modules.owns(frame.id()) {

@@ -322,6 +322,8 @@ impl Gateway {
                 self.bus_link(at, bus, link);
                 at
             }
+            // Time comes no further by that: frames that were received before it may still wait.
+            BusEvent::Sent { frame, at } => return self.bus_sent(at, bus, &frame),
             BusEvent::NotSent { frame, at } => {
                 self.bus_not_sent(at, bus, &frame);
                 at

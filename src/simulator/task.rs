@@ -192,7 +192,7 @@ impl Bench {
                     self.say(now, &counted(text, unsaid));
                 }
             }
-            BusEvent::Counters { .. } => {}
+            BusEvent::Sent { .. } | BusEvent::Counters { .. } => {}
         }
     }
 

@@ -16,6 +16,7 @@ use super::tasks::Tasks;
 use super::wiring::{COMMANDS, Installation, LAST_FRAMES, Parts, TRANSMIT, bind_cia309};
 use super::{certificates, health};
 use crate::can::interface::Interface;
+use crate::can::task::Sending;
 use crate::can::{self, BusEvent, BusIndex, CanFrame};
 use crate::canopen::Role;
 use crate::gateway::order::{Exchange, Order};
@@ -84,7 +85,7 @@ pub(super) struct BusPart {
 #[derive(Debug)]
 pub(super) struct NewBus {
     interface: Interface,
-    passive: bool,
+    sending: Sending,
     pub(super) part: BusPart,
     frames: mpsc::Receiver<CanFrame>,
 }
@@ -98,15 +99,16 @@ impl Running {
         let (port, task) = (self.next_port, format!("bus {interface}"));
         self.next_port += 1;
         let known = BusPart { task, port, transmit };
-        Some(NewBus { interface, passive: role == Some(Role::Passive), part: known, frames })
+        let sending = if role == Some(Role::Passive) { Sending::Never } else { Sending::Told };
+        Some(NewBus { interface, sending, part: known, frames })
     }
 
     /// Starts the task of a bus.
     pub(super) fn spawn_bus(&mut self, new: NewBus) {
-        let NewBus { interface, passive, part, frames } = new;
+        let NewBus { interface, sending, part, frames } = new;
         let (events, clock) = (self.events.clone(), self.clock);
         self.tasks.spawn_part(part.task, &self.stop_buses, |stop| {
-            can::task::run(BusIndex(part.port), interface, passive, events, frames, clock, stop)
+            can::task::run(BusIndex(part.port), interface, sending, events, frames, clock, stop)
         });
     }
 

@@ -80,7 +80,9 @@ impl Conversation {
     fn drain(&mut self) {
         while let Some(output) = self.gateway.poll_output() {
             match output {
-                Output::Transmit { frame, .. } => {
+                Output::Transmit { bus, frame } => {
+                    let at = self.moment();
+                    self.gateway.handle_input(at, Input::Bus { bus, event: BusEvent::Sent { frame, at } });
                     self.all_sent.push(frame);
                     let entry = (self.now, frame.to_string());
                     if frame.is_remote() {

@@ -280,6 +280,8 @@ impl World {
                 Output::Transmit { frame, .. } => {
                     self.sent.insert(frame.to_string());
                     self.send(Sender::Gateway, frame);
+                    let at = self.now();
+                    gateway.handle_input(at, Input::Bus { bus: BUS, event: BusEvent::Sent { frame, at } });
                 }
                 Output::Reply { id, outcome } => {
                     assert!(self.replies.insert(id, outcome).is_none(), "one answer to each request");

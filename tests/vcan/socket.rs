@@ -281,16 +281,24 @@ impl Task {
         let (transmit, to_send) = mpsc::channel(64);
         let stop = CancellationToken::new();
         let interface: Interface = interface.parse().unwrap();
-        tokio::spawn(task::run(BusIndex(0), interface, false, events, to_send, Clock::start(), stop.clone()));
+        tokio::spawn(task::run(
+            BusIndex(0),
+            interface,
+            task::Sending::Told,
+            events,
+            to_send,
+            Clock::start(),
+            stop.clone(),
+        ));
         Self { events: told, transmit, stop }
     }
 
-    /// The next event that is not the report of the counters.
+    /// The next event that is not the report of the counters, nor of a frame that was sent.
     async fn next(&mut self) -> BusEvent {
         loop {
             let event = tokio::time::timeout(PATIENCE, self.events.recv()).await.expect("nothing came");
             let (_, event) = event.unwrap();
-            if !matches!(event, BusEvent::Counters { .. }) {
+            if !matches!(event, BusEvent::Counters { .. } | BusEvent::Sent { .. }) {
                 return event;
             }
         }

@@ -252,6 +252,8 @@ pub(super) struct Bench {
     pub(super) modules: Vec<Pretended>,
     /// Frames that are given back as not sent, by how they begin.
     pub(super) refuse: Vec<&'static str>,
+    /// Frames wait on their way to the bus: nobody is told that they left.
+    pub(super) holds_back: bool,
     coming: BTreeMap<(u64, u64), CanFrame>,
     count: u64,
     now: u64,
@@ -272,6 +274,7 @@ impl Bench {
             network: Network::new(settings, Now::from_millis(0)),
             modules,
             refuse: Vec::new(),
+            holds_back: false,
             coming: BTreeMap::new(),
             count: 0,
             now: 0,
@@ -400,6 +403,9 @@ impl Bench {
                         continue;
                     }
                     self.lines.push(format!("{millis} {text}"));
+                    if !self.holds_back {
+                        self.network.handle_sent(self.now(), &frame);
+                    }
                     for module in &mut self.modules {
                         if let Some(answer) = module.react(&frame) {
                             self.count += 1;

@@ -142,11 +142,13 @@ fn run_late(
     let mut done = 0;
     for round in 0.. {
         assert!(round < 2_000_000, "no end");
+        let mut sent = Vec::new();
         while let Some(output) = network.poll_output() {
             match output {
                 NetworkOutput::Transmit(frame) => {
                     let (_, ring) = rings.iter_mut().find(|(id, _)| *id == frame.id()).unwrap();
                     ring.put(now, frame.data().len());
+                    sent.push(frame);
                 }
                 NetworkOutput::Module(_, crate::esd::ModuleEvent::SendDone { .. }) => done += 1,
                 NetworkOutput::Module(..) | NetworkOutput::ForeignCommand(_) => {}
@@ -154,6 +156,12 @@ fn run_late(
         }
         if done == jobs {
             return now;
+        }
+        if !sent.is_empty() {
+            for frame in sent {
+                network.handle_sent(moment(now), &frame);
+            }
+            continue;
         }
         let (due, _) = network.poll_timeout().unwrap();
         now = now.max(due.as_micros()).max(if due.as_micros() > now {
@@ -215,6 +223,52 @@ fn r_esd_037_timers_that_are_very_late_slow_a_line_down_and_overflow_nothing() {
     let (network, mut rings) = full_network(260, 1, 1_000_000);
     run_late(network, &mut rings, 10, |_| 100_000);
     assert!(rings.iter().all(|(_, ring)| ring.highest <= 72));
+}
+
+#[test]
+fn r_esd_037_what_waits_on_its_way_to_the_bus_does_not_drain_and_more_comes_only_when_it_left() {
+    let mut bench = bench(with_byte_time(1000));
+    bench.holds_back = true;
+    bench.send(0, 1, &[0x55; 512]).run(5_000);
+    assert_eq!(bench.frames().len(), 8, "64 bytes, however long they wait");
+    // Five of them leave.
+    for _ in 0..5 {
+        let now = bench.now();
+        bench.network.handle_sent(now, &"15F#5555555555555555".parse().unwrap());
+    }
+    bench.drain();
+    bench.run(5_005);
+    assert_eq!(bench.frames().len(), 0, "they are in the ring now");
+    bench.run(5_100);
+    assert_eq!(bench.frames().len(), 5, "as many as are known to have left and drained");
+}
+
+#[test]
+fn r_esd_037_a_gap_is_kept_after_a_frame_that_left_late() {
+    let mut settings = tunnel();
+    settings.channels[0].gap = Some(Duration::from_millis(7));
+    let mut bench = bench(settings);
+    bench.holds_back = true;
+    bench.send(0, 1, &[0; 16]).run(100);
+    assert_eq!(bench.frames().len(), 1);
+    let now = bench.now();
+    bench.network.handle_sent(now, &"15F#0000000000000000".parse().unwrap());
+    bench.run(200);
+    let lines = bench.take();
+    assert!(lines.iter().any(|line| line.starts_with("107 15F#")), "{lines:?}");
+}
+
+#[test]
+fn r_esd_037_frames_that_leave_in_order_tell_of_those_before_them() {
+    let mut bench = bench(with_byte_time(1000));
+    bench.holds_back = true;
+    let bytes: Vec<u8> = (0..128).collect();
+    bench.send(0, 1, &bytes).run(100);
+    assert_eq!(bench.frames().len(), 8);
+    let now = bench.now();
+    bench.network.handle_sent(now, &"15F#38393A3B3C3D3E3F".parse().unwrap());
+    bench.run(200);
+    assert_eq!(bench.frames().len(), 8, "all eight left");
 }
 
 #[test]
@@ -451,6 +505,7 @@ fn equal_frames_of_two_jobs_do_not_hide_a_hole() {
 #[test]
 fn a_frame_that_was_given_out_just_now_is_counted_when_an_earlier_one_comes_back() {
     let mut bench = bench(with_byte_time(10_000));
+    bench.holds_back = true;
     let bytes: Vec<u8> = (0..100).collect();
     bench.send(0, 1, &bytes);
     let now = bench.now();

@@ -117,6 +117,9 @@ fn a_hundred_thousand_random_frames_do_no_harm() {
                         NetworkOutput::Transmit(frame) => {
                             assert!(!passive, "{frame}");
                             assert_allowed(&frame);
+                            if dice.roll(2) == 0 {
+                                network.handle_sent(moment(now), &frame);
+                            }
                             ours.push_back(frame);
                             ours.truncate(16);
                         }
@@ -333,6 +336,7 @@ proptest! {
                         NetworkOutput::Transmit(frame) => {
                             let line = lines.iter().position(|id| *id == frame.id()).unwrap();
                             out[line].extend(frame.data());
+                            network.handle_sent(moment(now), &frame);
                         }
                         NetworkOutput::Module(_, ModuleEvent::Received { channel, chunk }) => {
                             told[channel].extend(chunk.bytes());
