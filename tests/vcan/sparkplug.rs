@@ -15,6 +15,8 @@ use crate::harness::proxy::Cable;
 use crate::harness::wait::{give_it, wait_for, wait_until};
 
 const GROUP: &str = "works";
+/// Of channel 1.
+const INTENSITY_RAW: u16 = 140;
 
 /// The host application.
 struct Host {
@@ -52,13 +54,17 @@ impl Host {
 
     /// Waits for a message from number `from` on.
     fn wait_for(&self, kind: &str, device: &str, from: usize, wanted: impl Fn(&Value) -> bool) -> Value {
-        wait_for(format!("{kind} of {device}"), || {
+        self.find(&format!("{kind} of {device}"), from, |message| {
+            message["kind"] == kind && message["device"] == device && wanted(message)
+        })
+    }
+
+    /// As [`wait_for`](Self::wait_for), of whatever kind and device.
+    fn find(&self, what: &str, from: usize, wanted: impl Fn(&Value) -> bool) -> Value {
+        wait_for(what, || {
             self.count();
             let messages = self.messages.borrow();
-            let mut since = messages.iter().skip(from);
-            since
-                .find(|message| message["kind"] == kind && message["device"] == device && wanted(message))
-                .cloned()
+            messages.iter().skip(from).find(|message| wanted(message)).cloned()
         })
     }
 
@@ -112,7 +118,10 @@ fn a_foreign_host_finds_births_deaths_rebirth_and_the_wrap_of_the_sequence_right
     }
     let birth = host.births(0, 3);
     assert_eq!(birth["bdseq"], 0);
-    host.wait_for("DDATA", "engine1", 0, |data| shows(data, "knock_intensity_1", 20.0));
+    // A birth tells it where the devices spoke before the broker answered.
+    host.find("the value of engine1", 0, |message| {
+        message["device"] == "engine1" && shows(message, "knock_intensity_1", 20.0)
+    });
 
     // While an engine knocks, up to ten messages a second are made of it: the sequence number wraps.
     feed(&devices, 51, 0x01);
@@ -149,6 +158,10 @@ fn a_foreign_host_finds_births_deaths_rebirth_and_the_wrap_of_the_sequence_right
     assert_eq!(host.wait_for("NDEATH", "", before, any)["bdseq"], 0, "by the broker");
     for knock in [102, 153, 204] {
         feed(&devices, knock, 0);
+        wait_until("the value in the registers", || {
+            gateway.node(3).register(INTENSITY_RAW) == u16::from(knock)
+        });
+        // A state of it is made within `min_interval_ms`.
         give_it(Duration::from_secs(1));
     }
     cable.plug();
