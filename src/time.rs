@@ -144,11 +144,23 @@ impl Clock {
         Self { origin: tokio::time::Instant::now() }
     }
 
-    /// The present moment.
+    /// The present moment. The two clocks are read at the same time, but for a millisecond: a thread that was kept waiting
+    /// between them reads them again, a few times at most.
     #[must_use]
     pub fn now(&self) -> Now {
-        let elapsed = tokio::time::Instant::now().saturating_duration_since(self.origin);
-        let utc = match SystemTime::now().duration_since(UNIX_EPOCH) {
+        const TRIES: usize = 4;
+        const APART: Duration = Duration::from_millis(1);
+        let mut begin = tokio::time::Instant::now();
+        let mut utc = SystemTime::now();
+        for _ in 1..TRIES {
+            let end = tokio::time::Instant::now();
+            if end.saturating_duration_since(begin) <= APART {
+                break;
+            }
+            (begin, utc) = (end, SystemTime::now());
+        }
+        let elapsed = begin.saturating_duration_since(self.origin);
+        let utc = match utc.duration_since(UNIX_EPOCH) {
             Ok(after) => i64::try_from(after.as_micros()).unwrap_or(i64::MAX),
             Err(before) => i64::try_from(before.duration().as_micros()).map_or(i64::MIN, |micros| -micros),
         };

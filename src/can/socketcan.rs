@@ -141,9 +141,10 @@ impl BusReader for SocketReader {
             tokio::select! {
                 readable = self.shared.socket.readable() => {
                     let mut readable = readable.map_err(|error| io_error(&self.shared.name, error))?;
+                    // What is read now came before the clock is read again, and the socket was not empty before it was looked at.
                     let now = self.clock.now();
                     let fd = self.shared.socket.get_ref().as_raw_fd();
-                    let received = receive(fd, &mut self.buffers, now, &mut self.intake);
+                    let received = receive(fd, &mut self.buffers, self.clock, &mut self.intake);
                     if emptied(received) {
                         // What came since has set readiness anew.
                         readable.clear_ready();
@@ -259,13 +260,15 @@ impl Intake {
 fn receive(
     fd: RawFd,
     buffers: &mut [[u8; FD_SIZE]; BATCH],
-    now: Now,
+    clock: Clock,
     intake: &mut Intake,
 ) -> nix::Result<usize> {
     // Made anew for each batch: the call shortens the room for control messages to what it used.
     let mut headers = MultiHeaders::<()>::preallocate(BATCH, Some(nix::cmsg_space!(TimeSpec, u32)));
     let mut slices = buffers.each_mut().map(|buffer| [IoSliceMut::new(buffer)]);
     let messages = recvmmsg(fd, &mut headers, slices.iter_mut(), MsgFlags::MSG_DONTWAIT, None)?;
+    // Not before: this thread may have been kept waiting for long in between, and the frames came meanwhile.
+    let now = clock.now();
     let mut count = 0;
     for message in messages {
         count += 1;
