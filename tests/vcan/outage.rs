@@ -34,12 +34,12 @@ fn now_ms() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_millis() as u64
 }
 
-/// Messages of either kind that are kept for the broker.
-fn waiting(gateway: &Gateway) -> Option<f64> {
+/// Events and states that are kept for the broker.
+fn waiting(gateway: &Gateway) -> Option<[f64; 2]> {
     let text = gateway.get("/metrics");
     let lines = text.lines().filter(|line| line.starts_with("cangate_mqtt_buffer_waiting{"));
     let figures: Vec<f64> = lines.filter_map(|line| line.rsplit(' ').next()?.parse().ok()).collect();
-    (figures.len() == 2).then(|| figures.iter().sum())
+    figures.try_into().ok()
 }
 
 /// Every message of the gateway, into a file.
@@ -112,11 +112,18 @@ fn p1_p3_a_plant_of_sixteen_engines_loses_no_event_while_the_broker_is_away_and_
     let (mut killed, mut started, mut slowest) = (Vec::new(), begin, Duration::ZERO);
     for moment in moments {
         give_it(Duration::from_millis(moment).saturating_sub(begin.elapsed()));
+        let kept = waiting(&gateway);
         killed.push((now_ms(), started.elapsed()));
         gateway.process.kill();
         started = Instant::now();
         gateway.start_again();
         slowest = slowest.max(started.elapsed());
+        if let Some([events, states]) = kept {
+            wait_until(
+                format!("the {events} events and {states} states that were kept before the kill"),
+                || waiting(&gateway).is_some_and(|found| found[0] >= events && found[1] >= states),
+            );
+        }
     }
     give_it(Duration::from_secs(seconds).saturating_sub(begin.elapsed()));
     let (connections, away) = (cable.connections(), begin.elapsed());
@@ -126,7 +133,7 @@ fn p1_p3_a_plant_of_sixteen_engines_loses_no_event_while_the_broker_is_away_and_
     plant.kill();
     let patience = Duration::from_secs(60 + seconds);
     let drained = within(patience, || {
-        let is_empty = waiting(&gateway) == Some(0.0);
+        let is_empty = waiting(&gateway) == Some([0.0, 0.0]);
         let lost = gateway.get("/api/v1/events").matches("\"node_lost\"").count();
         (is_empty && lost >= usize::from(NODES)).then_some(())
     });
