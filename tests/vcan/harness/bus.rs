@@ -57,10 +57,21 @@ pub struct Capture {
 impl Capture {
     /// Starts candump and waits until it listens.
     pub fn start() -> Self {
+        Self::start_on(BUS)
+    }
+
+    /// As [`start`](Self::start), of these 11-bit identifiers only: a guest has no room for millions of frames.
+    pub fn start_of(ids: &[u16]) -> Self {
+        let mut filters = vec![format!("{BUS},{}:7FF", MARK.trim_end_matches('#'))];
+        filters.extend(ids.iter().map(|id| format!("{id:03X}:7FF")));
+        Self::start_on(&filters.join(","))
+    }
+
+    fn start_on(bus: &str) -> Self {
         // -L: log format; -D: stay when the interface goes down; -r: room for what comes while a machine that is busy
         // elsewhere does not let it read; -e is left out: error frames are no frames of a participant.
         let candump =
-            Process::start("candump", Command::new("candump").args(["-L", "-D", "-r", "8000000", BUS]));
+            Process::start("candump", Command::new("candump").args(["-L", "-D", "-r", "8000000", bus]));
         // Sent until it is seen.
         let capture = Self { candump };
         wait_until("candump to listen", || {
