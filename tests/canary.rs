@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs;
-use std::net::{SocketAddr, TcpListener};
+use std::net::SocketAddr;
 use std::os::unix::ffi::OsStringExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -22,6 +22,7 @@ use tokio::net::TcpStream;
 use crate::support::http::{Answer, converse};
 use crate::support::mosquitto::Probe;
 use crate::support::pki::{Authority, Folder};
+use crate::support::ports::free_address;
 use crate::support::secure_web::connect;
 use crate::support::{PATIENCE, until};
 
@@ -97,10 +98,6 @@ impl Drop for Running {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
-}
-
-fn free_address() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
 }
 
 /// An installation with a secret in every place that takes one.

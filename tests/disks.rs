@@ -12,10 +12,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use nix::sys::signal::Signal;
 use tokio::net::TcpStream;
 
-use crate::kills::{
-    Broker, Running, Way, adapter, configuration, free_address, get, has_judges, judge, metric,
-};
+use crate::kills::{Broker, Running, Way, adapter, configuration, get, has_judges, judge, metric};
 use crate::support::modbus::{RawClient, frame};
+use crate::support::ports::free_address;
 use crate::support::registers::pdu;
 use crate::support::until;
 use cangate::time::Clock;

@@ -15,6 +15,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
 
+use crate::support::ports::free_address;
 use crate::support::until;
 
 const MAPPING: &str = r#"
@@ -85,10 +86,6 @@ pub(crate) fn has_judges() -> bool {
         eprintln!("skipped: `{missing}` does not run (apt-get install mosquitto mosquitto-clients python3)");
     }
     missing.is_none()
-}
-
-pub(crate) fn free_address() -> SocketAddr {
-    std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
 }
 
 /// An adapter whose bus has one device: its trip comes and goes fifty times a second, and its state ten times, until it is to be

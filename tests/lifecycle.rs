@@ -13,6 +13,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio_modbus::client::{Context, Reader, tcp};
 use tokio_modbus::slave::Slave;
 
+use crate::support::ports::free_address;
 use crate::support::{PATIENCE, until};
 
 /// The program under test.
@@ -52,11 +53,6 @@ impl Drop for Running {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
-}
-
-/// An address that nobody listens on now.
-fn free_address() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
 }
 
 fn configuration(folder: &Path, bus: &str, modbus: SocketAddr, http: SocketAddr) -> PathBuf {

@@ -15,8 +15,9 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::support::fake_broker::{Control, FakeBroker, Received, Script, read_packet, read_publish};
-use crate::support::mqtt_client::{Client, WINDOW, assert_delivered, free_address, seq, until};
+use crate::support::mqtt_client::{Client, WINDOW, assert_delivered, seq, until};
 use crate::support::plant;
+use crate::support::ports::free_address;
 
 /// Runs a test with each version of MQTT.
 async fn both(test: impl AsyncFn(MqttVersion)) {
@@ -99,7 +100,7 @@ async fn qos_0_is_for_states_only() {
 
 #[tokio::test]
 async fn p7_a_broker_that_is_absent_at_the_start_is_found_when_it_comes() {
-    let address = free_address().await;
+    let address = free_address();
     let mut client = Client::start(address);
     client.happen(5);
     client.until(|status| status.failures >= 3).await;
@@ -421,7 +422,7 @@ struct Mosquitto {
 
 impl Mosquitto {
     /// `None` where it is not installed; in CI that is a failure.
-    async fn start() -> Option<Self> {
+    fn start() -> Option<Self> {
         let found = Command::new("mosquitto").arg("-h").stdout(Stdio::null()).stderr(Stdio::null()).status();
         if found.is_err() {
             assert!(
@@ -431,7 +432,7 @@ impl Mosquitto {
             eprintln!("skipped: mosquitto is not installed (apt-get install mosquitto)");
             return None;
         }
-        let address = free_address().await;
+        let address = free_address();
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("mosquitto.conf");
         let text =
@@ -488,7 +489,7 @@ async fn gate(broker: SocketAddr, open: watch::Receiver<bool>) -> (SocketAddr, J
 #[tokio::test]
 async fn p1_p5_p6_f50_mosquitto_killed_twenty_times_under_load_loses_no_event() {
     both(async |version| {
-        let Some(mut mosquitto) = Mosquitto::start().await else { return };
+        let Some(mut mosquitto) = Mosquitto::start() else { return };
         let subscriber = Subscriber::start(mosquitto.address, "subscriber");
         let (open, opened) = watch::channel(false);
         let (address, gate) = gate(mosquitto.address, opened).await;

@@ -18,6 +18,7 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
 use crate::support::pki::{Authority, Folder, begins_tomorrow, expires_in};
+use crate::support::ports::free_address;
 use crate::support::{PATIENCE, plant};
 
 /// mosquitto that wants TLS, and ends with the test.
@@ -30,7 +31,7 @@ impl Mosquitto {
     /// With `server.pem`, `server.key` and `ca.pem` of a folder; `more` are lines of its configuration. `None` where it is not
     /// installed; in CI that is a failure.
     async fn start(folder: &Folder, more: &str) -> Option<Self> {
-        Self::start_at(free_address().await, folder, more).await
+        Self::start_at(free_address(), folder, more).await
     }
 
     async fn start_at(address: SocketAddr, folder: &Folder, more: &str) -> Option<Self> {
@@ -76,10 +77,6 @@ impl Drop for Mosquitto {
         let _ = self.process.kill();
         let _ = self.process.wait();
     }
-}
-
-async fn free_address() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap()
 }
 
 /// A gateway's MQTT client.
@@ -223,7 +220,7 @@ async fn without_a_client_certificate_or_with_a_wrong_one_the_broker_refuses_and
 #[tokio::test]
 async fn a_port_without_tls_a_port_without_anybody_and_files_that_are_wrong_are_told_apart() {
     let plant = Plant::new();
-    let nobody = free_address().await;
+    let nobody = free_address();
     let (trouble, _) = refused(&format!("mqtts://{nobody}"), &plant.tls).await;
     assert_eq!(trouble, SessionTrouble::Unreachable);
     // Brokers without TLS take a hello for a malformed packet and hang up.

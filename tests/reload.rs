@@ -29,11 +29,8 @@ use tokio_modbus::slave::Slave;
 use tokio_util::sync::CancellationToken;
 
 use crate::support::mosquitto::{Mosquitto, Probe, Seen};
+use crate::support::ports::free_address;
 use crate::support::until;
-
-pub fn free_address() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
-}
 
 pub fn fresh(text: &str) -> Result<Fresh, Refusal> {
     let source = SourceText::new("cangate.toml", text);

@@ -12,7 +12,8 @@ use cangate::time::Clock;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
-use crate::reload::{free_address, fresh, reloads, status};
+use crate::reload::{fresh, reloads, status};
+use crate::support::ports::free_address;
 use crate::support::until;
 
 /// A gateway in this process.

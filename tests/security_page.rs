@@ -1,13 +1,14 @@
 //! The page about security, run as it stands: its commands make certificates, with which a broker, the gateway and a PLC meet.
 
 use std::io::{Read, Write};
-use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use cangate::tls::TlsClientSettings;
 use serde_json::Value;
 
+use crate::support::ports::free_address;
 use crate::support::secure_modbus::{READ, SecureClient};
 use crate::support::until;
 
@@ -19,10 +20,6 @@ impl Drop for Running {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
-}
-
-fn free_address() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
 }
 
 /// Whether a program is there; in CI it must be.

@@ -1,6 +1,5 @@
 //! The page over TLS: certificates, their exchange, clients that want something else, and curl as a foreign judge.
 
-use std::net::TcpListener;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
@@ -12,6 +11,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 use crate::support::pki::{Authority, Folder, expires_in};
+use crate::support::ports::free_address;
 use crate::support::secure_web::{SecureWeb, connect, files, state};
 use crate::support::{PATIENCE, plant, until};
 
@@ -205,7 +205,7 @@ async fn the_program_serves_tls_watches_its_certificate_and_asks_itself_whether_
     let (folder, authority) = (Folder::new(), Authority::new("plant"));
     let tls = files(&folder, &authority);
     let ca = folder.write("ca.pem", &authority.pem);
-    let http = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let http = free_address();
     let configuration = format!(
         "version = 1\n[gateway]\nname = \"hall-1\"\n[modbus]\nlisten = []\n[http]\nlisten = \"{http}\"\n\
          [http.tls]\ncert_file = \"{}\"\nkey_file = \"{}\"\n",

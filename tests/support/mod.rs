@@ -8,6 +8,7 @@ pub mod mosquitto;
 pub mod mqtt_client;
 pub mod pki;
 pub mod plant;
+pub mod ports;
 pub mod registers;
 pub mod secure_modbus;
 pub mod secure_web;

@@ -6,10 +6,10 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, PublishOptions, QoS};
-use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 
 use super::until;
+use crate::support::ports::free_address;
 
 /// mosquitto on a port of its own.
 pub struct Mosquitto {
@@ -35,7 +35,7 @@ impl Mosquitto {
             eprintln!("skipped: mosquitto is not installed (apt-get install mosquitto)");
             return None;
         }
-        let address = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
+        let address = free_address();
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("mosquitto.conf");
         let text = format!(

@@ -11,7 +11,6 @@ use cangate::mqtt::{Identity, MqttSettings, MqttStatus, MqttVersion, Publisher};
 use cangate::process_image::handles::process_image;
 use cangate::process_image::{ImageWriter, ProcessImage, Revision};
 use cangate::time::Clock;
-use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -143,8 +142,4 @@ pub fn assert_delivered(events: &[(usize, String)], last: u64) {
     }
     assert_eq!(newest, last);
     assert!(doubled.values().all(|count| *count <= WINDOW), "{doubled:?}");
-}
-
-pub async fn free_address() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap()
 }

@@ -165,9 +165,9 @@ impl Gateway {
     }
 
     fn wait_until_it_serves(&mut self) {
-        wait_until("the gateway to serve Modbus", || {
+        wait_until("the gateway to serve Modbus and HTTP", || {
             assert!(self.process.runs(), "cangate run ended");
-            TcpStream::connect(("127.0.0.1", self.modbus)).is_ok()
+            [self.modbus, self.http].iter().all(|port| TcpStream::connect(("127.0.0.1", *port)).is_ok())
         });
     }
 

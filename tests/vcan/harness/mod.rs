@@ -6,6 +6,8 @@ pub mod device;
 pub mod flood;
 pub mod gateway;
 pub mod modbus;
+#[path = "../../support/ports.rs"]
+pub mod ports;
 pub mod process;
 pub mod proxy;
 pub mod wait;

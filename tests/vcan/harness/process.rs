@@ -134,7 +134,7 @@ pub fn run(program: &str, arguments: &[&str]) -> (bool, String, String) {
     (output.status.success(), text(&output.stdout), text(&output.stderr))
 }
 
-/// A TCP port of 127.0.0.1 that is free now.
+/// A TCP port of 127.0.0.1 at which nobody listens, given to nobody else.
 pub fn free_port() -> u16 {
-    std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+    super::ports::free_address().port()
 }
