@@ -23,8 +23,8 @@ use crate::simulator::task::{self, BusEnd};
 use crate::simulator::{DeviceNumber, DevicePlan, Kind, Scenario, Settings, SimulatorError};
 use crate::time::Clock;
 
-/// Frames that wait for the bus. 127 devices that start at once send 508.
-const TRANSMIT_QUEUE: usize = 1024;
+/// Frames that wait for the bus: what fills it for a second at 1 Mbit/s, so that a machine that stalls for that long loses none.
+const TRANSMIT_QUEUE: usize = 8192;
 /// Events that wait for the devices.
 const EVENT_QUEUE: usize = 1024;
 /// Lines that wait; when there are more, reading pauses.
