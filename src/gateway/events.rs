@@ -210,14 +210,17 @@ impl EventLog {
         self.newest += 1;
         let mut event = Event { seq: self.newest, ts: now.utc, kind, node, bus, name, ..blank() };
         fill(&mut event);
+        let told = |text: &str| (!text.is_empty()).then(|| text.to_owned());
         tracing::info!(
             seq = event.seq,
             kind = event.kind.word(),
-            node = event.node.as_deref().or(event.bus.as_deref()).unwrap_or_default(),
-            from = event.from,
-            to = event.to,
-            "{}: {}",
+            node = event.node,
+            bus = event.bus,
+            from = told(&event.from),
+            to = told(&event.to),
+            "{}{}{}",
             event.name,
+            if event.text.is_empty() { "" } else { ": " },
             event.text
         );
         self.pending.push(event);
