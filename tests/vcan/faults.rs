@@ -182,9 +182,10 @@ fn requests_that_a_bus_that_is_down_could_not_take_are_not_made_up_for() {
     let frames = capture.count();
     ip(&["link", "set", BUS, "up"]);
     capture.wait_for("701#R1", frames);
-    wait_until("more requests", || capture.count() >= frames + 5);
+    wait_until("more requests", || capture.count() >= frames + 12);
     let times: Vec<f64> = capture.timed().iter().skip(frames).map(|(at, _)| *at).collect();
-    let gaps: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();
-    assert!(gaps.iter().all(|gap| *gap > 0.2), "guard time 500 ms; gaps {gaps:?}");
+    // Eleven guard times of 500 ms; six less if what was missed came at once. One late request makes single gaps short.
+    let span = times[11] - times[0];
+    assert!(span > 4.0, "twelve requests in {span} s: {times:?}");
     drop(gateway);
 }
